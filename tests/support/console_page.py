@@ -132,6 +132,22 @@ class Page:
         shown = "document.querySelector('[data-robot=arm] [data-value=elbow]').textContent"
         return f"Math.abs(parseFloat({shown}.replace('\u2212', '-')) - {value}) < 0.03"
 
+    def curve(self, key: str, signal: str) -> list[float]:
+        """Return what the pointer reads of a signal along the curves with a key, from left to right."""
+        read: list[str] = self.driver.execute_async_script(
+            "const [key, signal, done] = arguments; const one = document.querySelector(`[data-sensor='${key}']`);"
+            "one.scrollIntoView({block: 'center'}); const box = one.querySelector('canvas').getBoundingClientRect();"
+            "const shown = [...one.querySelectorAll('.signal')].find(one => one.children[1].textContent === signal);"
+            "const painted = () => new Promise(go => requestAnimationFrame(() => requestAnimationFrame(go)));"
+            "(async () => { const read = []; for (let share = 0; share < 1; share += 0.05) {"
+            "one.querySelector('canvas').dispatchEvent(new PointerEvent('pointermove',"
+            "{clientX: box.left + 48 + share * (box.width - 56), clientY: box.top + 20}));"
+            "await painted(); read.push(shown.querySelector('.num').textContent); }"
+            "one.querySelector('canvas').dispatchEvent(new PointerEvent('pointerleave')); done(read); })()",
+            key, signal,
+        )  # fmt: skip
+        return [float(one.replace("\u2212", "-")) for one in read if one]
+
     def phone(self) -> contextlib.AbstractContextManager[None]:
         """Be as small as a phone for a while, and touched instead of clicked."""
 

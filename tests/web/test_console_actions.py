@@ -14,6 +14,7 @@ from made_recordings import Robot, write_recording
 from starlette.applications import Starlette
 from starlette.routing import Mount
 from starlette.testclient import TestClient
+from waiting import eventually
 
 from urlab_client.aio import URLabClient
 from urlab_client.console.description import describe
@@ -177,11 +178,55 @@ def test_a_robot_with_torque_motors_holds_its_home_pose_until_somebody_commands_
     assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
     http.post("/api/ops/set_mode", json={"mode": "live"})
     assert http.get("/api/status").json()["holding"] == [], "in live mode its law would come too late"
+    assert http.get("/api/log").json()[-1]["what"] == "let go"
+    assert http.post("/api/run", json={"running": True}).status_code == 200
+    try:
+        eventually(lambda: not any(http.get("/api/state").json()["articulations"]["quadruped"]["ctrl"]))
+    finally:
+        http.post("/api/run", json={"running": False})
+
+
+def test_physics_that_runs_goes_on_while_a_robot_begins_to_hold_its_pose(http: TestClient) -> None:
+    http.post("/api/ops/set_mode", json={"mode": "live"})
+    assert http.post("/api/run", json={"running": True}).status_code == 200
+
+    def status() -> dict[str, Any]:
+        found: dict[str, Any] = http.get("/api/status").json()
+        return found
+
+    eventually(lambda: status()["moving"])
+    try:
+        assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
+        assert (status()["mode"], status()["running"], status()["holding"]) == ("direct", True, ["quadruped"])
+        # Whoever steps is not told that somebody else does.
+        found = {one["subject"]: one["verdict"] for one in http.get("/api/explain").json()["findings"]}
+        assert found["play"] == "ok"
+    finally:
+        http.post("/api/run", json={"running": False})
+    http.post("/api/hold", json={"quadruped": False})
+    assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
+    assert not status()["running"], "what stood still does not begin by itself"
 
 
 ARM = """<mujoco><worldbody><body name="upper"><joint name="turn" axis="0 1 0"/><geom size="0.1" fromto="0 0 0 1 0 0"/>
 <body name="lower"><joint name="slide" type="slide"/><geom size="0.1"/></body></body></worldbody>
 <actuator><motor name="motor" joint="turn"/><position name="grip" joint="slide" kp="10"/></actuator></mujoco>"""
+
+
+def test_another_mode_ends_the_steps_of_the_console(http: TestClient) -> None:
+    def status() -> tuple[str, bool]:
+        found = http.get("/api/status").json()
+        return found["mode"], found["running"]
+
+    assert http.post("/api/run", json={"running": True}).status_code == 200
+    http.post("/api/ops/set_mode", json={"mode": "puppet"})
+    eventually(lambda: status() == ("puppet", False))
+    assert "in mode puppet no physics runs" in refusal(http.post("/api/run", json={"running": True}))
+    http.post("/api/ops/set_mode", json={"mode": "direct"})
+    assert status() == ("direct", False), "it would say that it runs, and take no step"
+    assert http.post("/api/run", json={"running": True}).status_code == 200
+    assert status() == ("direct", True)
+    assert http.post("/api/run", json={"running": False}).status_code == 200
 
 
 async def test_holding_a_pose_leaves_to_others_what_they_command(tmp_path: Path) -> None:

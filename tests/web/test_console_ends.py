@@ -77,6 +77,23 @@ def test_in_the_background_sigterm_ends_it_and_ctrl_c_is_ignored() -> None:
     assert handlers == [signal.SIG_IGN]
 
 
+def test_a_second_ctrl_c_does_not_break_off_its_end() -> None:
+    steps: list[str] = []
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        yield
+        steps.append("cleaned up")
+
+    def started() -> None:
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+
+    with bound("127.0.0.1", 0) as listener, graceful_exit():
+        asyncio.run(serve(Starlette(lifespan=lifespan), listener, started))
+    assert steps == ["cleaned up"]
+
+
 @pytest.fixture
 def converting(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """A conversion that writes half a file, says so, and goes on until its progress breaks it off."""

@@ -26,7 +26,10 @@ from urlab_client.console.session import ConsoleSession
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import ServerUnreachable
+from urlab_client.integrations.record import record
 from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.protocol.messages.session import Reset, ResetOk
+from urlab_client.protocol.messages.sim import BeginPie, StopPie
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app
 
@@ -152,6 +155,85 @@ async def test_a_number_that_the_program_wrote_is_not_sent_in_live_mode(tmp_path
         arm.set_ctrl(dict.fromkeys(others, 0.0))
         console.controls.set_points(ME, {"arm": {name: 0.2}})
         await until(lambda: console.view.snapshot is not None and 0.2 in arm_set_points(console))
+
+
+async def test_set_points_of_a_play_session_do_not_drive_the_next(tmp_path: Path) -> None:
+    async with mounted(tmp_path, "live") as (client, console):
+        await until(lambda: console.view.snapshot is not None)
+        first, second, *_ = client.articulations["arm"].actuators
+        console.controls.set_points(ME, {"arm": {first: 0.4}})
+        await until(lambda: 0.4 in arm_set_points(console))
+        await console.controls.do(ME, StopPie())
+        await until(lambda: any(entry.what == "play_ended" for entry in console.view.entries))
+        await console.controls.do(ME, BeginPie())
+        console.controls.set_points(ME, {"arm": {second: 0.2}})
+        await until(lambda: 0.2 in arm_set_points(console))
+        assert 0.4 not in arm_set_points(console)
+
+
+async def test_a_new_play_session_while_the_console_steps_is_no_failure(tmp_path: Path) -> None:
+    async with mounted(tmp_path) as (client, console):
+        await console.controls.run(ME, running=True)
+        await until(lambda: client.step_count > 0)
+        await console.controls.do(ME, StopPie())
+        await console.controls.do(ME, BeginPie())
+        assert not console.controls.running
+        assert [entry.text for entry in console.view.entries if entry.kind == "error"] == []
+
+
+async def test_after_a_replay_that_moved_the_simulation_the_console_steps_as_before(tmp_path: Path) -> None:
+    async with mounted(tmp_path) as (client, console):
+        async with record(client, tmp_path / "run.mcap"):
+            for _ in range(3):
+                await client.step()
+        for stop in (False, True):
+            await console.controls.run(ME, running=True)
+            await console.begin_replay(tmp_path / "run.mcap")
+            assert console.controls.running, "behind the replay the simulation goes on"
+            await console.begin_replay(tmp_path / "run.mcap", placing=True)
+            assert (client.step_mode, console.controls.running) == ("puppet", False)
+            with pytest.raises(ValueError, match="no physics runs"):
+                await console.controls.run(ME, running=True)
+            if stop:
+                await console.controls.run(ME, running=False)
+            await console.end_replay()
+            assert (client.step_mode, console.controls.running) == ("direct", not stop)
+        await console.controls.run(ME, running=True)
+        with pytest.raises(FileNotFoundError):
+            await console.begin_replay(tmp_path / "none.mcap", placing=True)
+        assert console.controls.running
+
+
+@pytest.mark.parametrize("mode", ["live", "direct"])
+async def test_a_reset_begins_without_earlier_set_points(mode: str, tmp_path: Path) -> None:
+    async with mounted(tmp_path, mode) as (client, console):
+        await until(lambda: console.view.snapshot is not None)
+        arm = client.articulations["arm"]
+        first = next(iter(arm.actuators))
+        for keyframe in (None, "home"):
+            console.controls.set_points(ME, {"arm": {first: 0.4}})
+            assert arm.ctrl_array[0] == 0.4
+            reply = await console.controls.do(ME, Reset(keyframe_name=keyframe))
+            assert isinstance(reply, ResetOk)
+            applied = reply.per_articulation["arm"].ctrl
+            assert applied is not None
+            assert keyframe or not applied.any()
+            assert arm.ctrl_array.tolist() == applied.tolist()
+            if mode == "live":
+                await until(lambda: 0.4 not in arm_set_points(console))
+        arm.set_ctrl({first: 0.3})  # by the program around it, which goes on
+        await console.controls.do(ME, Reset())
+        assert arm.ctrl_array[0] == 0.3
+
+
+async def test_the_log_says_once_who_sets_which_set_points(tmp_path: Path) -> None:
+    async with mounted(tmp_path) as (client, console):
+        first, second, *_ = client.articulations["arm"].actuators
+        for value in (0.1, 0.2, 0.3):
+            console.controls.set_points(ME, {"arm": {first: value}})
+        console.controls.set_points(ME, {"arm": {second: 0.1}})
+        said = [(entry.who, entry.text) for entry in console.view.entries if entry.what == "set-points"]
+        assert said == [("me", f'{{"arm":["{name}"]}}') for name in (first, second)]
 
 
 def arm_set_points(console: ConsoleSession) -> list[float]:

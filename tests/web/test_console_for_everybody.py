@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+import time
 import urllib.request
 import zipfile
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 from console_page import RUNNING, SLIDER, Page, command, link_in, opened
+from ports import free_port
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
@@ -26,6 +28,10 @@ FIND = """const done = arguments[0]; axe.run({resultTypes: ["violations"]}).then
 UNFOLD = """const closed = [...document.querySelectorAll('main details:not([open])')];
   closed.forEach((one) => { one.open = true; }); return closed"""
 FOLD = "arguments[0].forEach((one) => { one.open = false; })"
+FAR = """const fetched = window.fetch; window.fetch = async (...asked) => { const answer = await fetched(...asked);
+  await new Promise((resolve) => setTimeout(resolve, 1000)); return answer; };
+  window.near = () => { window.fetch = fetched; }"""
+"""Let each answer take a second longer, as from a console far away."""
 PANELS = "[...document.querySelectorAll('.column')].map((one) => [...one.children].map(({id}) => id))"
 SPOKEN = "document.querySelector('#announcements').textContent"
 TOP = f"document.querySelector('{SLIDER}').getBoundingClientRect().top"
@@ -104,6 +110,102 @@ def test_a_simulation_that_stands_still_shows_pictures_also_instead_of_the_3d_vi
     assert not still.look("document.querySelector('.instead .num').classList.contains('old')")
 
 
+def test_a_robot_that_has_fallen_is_stood_up_and_held(still: Page) -> None:
+    button, said = (f".robot[data-robot=quadruped] .still {part}" for part in ("button", "span"))
+    still.ask("api/run", {"running": True})
+    still.until(f"document.querySelector('{said}').textContent.startsWith('It has fallen.')")
+    assert still.look(f"document.querySelector('{button}').textContent") == "Reset and hold"
+    still.driver.execute_script(FAR)
+    still.click(button)
+    still.until(f"document.querySelector('{said}').textContent.startsWith('It holds its home pose until')")
+    still.driver.execute_script("window.near()")
+    still.asked("api/state", lambda state: state["time"] > 3.0)
+    assert still.ask("api/state")["articulations"]["quadruped"]["qpos"][2] > 0.25
+    still.click(button)  # lets it go
+    still.until(f"document.querySelector('{said}').textContent.startsWith('It has fallen.')")
+    still.ask("api/run", {"running": False})
+    still.ask("api/ops/reset", {})
+    still.ask("api/hold", {"quadruped": True})
+    still.until(f"document.querySelector('{said}').textContent.startsWith('It holds its home pose')")
+    still.click(button)  # while no step takes its torques away
+    still.until(
+        f"document.querySelector('{said}').textContent === 'Nothing drives it yet. Play makes it hold its pose.'"
+    )
+    still.ask("api/ops/set_mode", {"mode": "puppet"})
+    still.until(f"document.querySelector('{said}').textContent.startsWith('In mode puppet')")
+    still.until("[...document.querySelectorAll('.actuators')].every(one => one.inert)")
+    still.ask("api/ops/set_mode", {"mode": "live"})
+
+
+def test_a_page_says_nothing_of_states_that_have_come(still: Page) -> None:
+    """The console has been connected for longer than a first state may take, and no other status follows."""
+    still.asked("api/status", lambda status: time.time() - status["link"]["since"] > 6.0)
+    still.driver.refresh()
+    still.until("document.querySelector('#time').textContent.includes('s')")
+    assert still.look("document.querySelector('#banner').hidden")
+    assert "No state arrives" not in still.look(SPOKEN)
+
+
+def test_the_log_counts_only_what_is_the_same(still: Page) -> None:
+    lines = "[...document.querySelectorAll('.entries .call')].map((one) => one.innerText)"
+    for running in (True, False):
+        still.ask("api/run", {"running": running})
+    for percent in (50.0, 60.0):
+        still.ask("api/ops/set_sim_speed", {"percent": percent})
+    still.until(f"/set the speed to 60 %\\s+.2$/.test(({lines}).at(-1).trim())")
+    said = still.look(f"({lines}).slice(-3)")
+    assert "let physics run" in said[0]
+    assert "paused physics" in said[1] or "stopped physics" in said[1]
+    still.ask("api/ops/set_sim_speed", {"percent": 100.0})
+
+
+def test_a_panel_folds_and_stays_so(still: Page) -> None:
+    scene = "document.querySelector('#scene')"
+    title = f"{scene}.querySelector('h2 > .fold')"
+    assert still.look(f"{scene}.querySelector('.actors').offsetHeight > 0")
+    still.look(f"{title}.click()")
+    assert still.look(f"[{title}.ariaExpanded, {scene}.querySelector('.actors').offsetHeight]") == ["false", 0]
+    still.driver.refresh()
+    still.until(f"{scene}.querySelector('[data-actor]') !== null")
+    assert still.look(f"[{title}.ariaExpanded, {scene}.querySelector('.actors').offsetHeight]") == ["false", 0]
+    still.look(f"{title}.click()")
+    assert still.look(f"{title}.ariaExpanded === 'true' && {scene}.querySelector('.actors').offsetHeight > 0")
+
+
+def test_a_number_out_of_reach_is_not_set_silently(still: Page) -> None:
+    box = still.find("[data-robot=arm] [data-set-point=elbow]")
+    box.send_keys(Keys.CONTROL, "a")
+    box.send_keys("99", Keys.ENTER)
+    still.until("document.querySelector('#toasts').innerText.includes('99 is out of reach')")
+    still.until("document.querySelector('#log').innerText.includes('set elbow of arm')")
+
+
+def test_an_edit_of_the_level_is_marked_until_play_begins_again(still: Page) -> None:
+    due = "!document.querySelector('#edits-due').hidden && document.querySelector('#restart').matches('.due')"
+    assert not still.look(due)
+    box = still.find("[data-actor=arm] input")
+    before = box.get_attribute("value")
+    for value in ("0.7", before):
+        box.send_keys(Keys.CONTROL, "a")
+        box.send_keys(value, Keys.ENTER)
+        still.until(due)
+        still.until("document.querySelector('#log').innerText.includes('moved arm')")
+    still.ask("api/ops/stop_pie", {})
+    still.ask("api/ops/begin_pie", {})
+    still.until(f"!({due})")
+
+
+def test_a_page_that_gets_no_states_says_why(tmp_path: Path) -> None:
+    ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
+    with contextlib.ExitStack() as stack:
+        _, line = stack.enter_context(command("serve", "ball", "--play", "--json", *ports))
+        ready = json.loads(line)
+        wrong = [f"--step-port={ready['step_port']}", f"--state-port={free_port()}", "--port=0"]
+        _, said = stack.enter_context(command("console", ready["address"], *wrong))
+        one = stack.enter_context(opened(tmp_path, link_in(said)))
+        one.until("document.querySelector('#banner').textContent.startsWith('No state arrives.')")
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("small", [False, True], ids=["desk", "phone"])
 def test_axe_finds_nothing(still: Page, scheme: str, small: bool) -> None:
@@ -117,6 +219,7 @@ def test_axe_finds_nothing(still: Page, scheme: str, small: bool) -> None:
     with contextlib.ExitStack() as stack:
         if small:
             stack.enter_context(still.phone())
+            still.until("getComputedStyle(document.querySelector('#sheet')).opacity === '0'")  # it fades
             assert driver.execute_async_script(FIND) == []
             still.click("#sheet-toggle")
             still.until("getComputedStyle(document.querySelector('#sheet')).opacity === '1'")
@@ -127,7 +230,7 @@ def test_axe_finds_nothing(still: Page, scheme: str, small: bool) -> None:
         for opens, dialog in (
             ("[aria-label=Keys]", "help"),
             ("#invite", "invitation"),
-            (".robot h2 button", "findings"),
+            (".robot .why", "findings"),
         ):
             still.click(opens)
             still.until(f"document.querySelector('#{dialog}').open")

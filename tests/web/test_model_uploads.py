@@ -144,6 +144,8 @@ def test_an_upload_that_goes_over_the_wire_says_what_it_replaces(http: TestClien
 @pytest.mark.parametrize("http", ["alpha"], indirect=True)
 def test_a_server_that_can_neither_read_nor_receive_a_model_says_so(http: TestClient, tmp_path: Path) -> None:
     said = refusal(http.put("/api/models/crate.xml", content=BALL), 409)
+    last = http.get("/api/log").json()[-1]
+    assert (last["kind"], last["what"], last["text"]) == ("error", "import model", f"crate.xml: {said}")
     assert said.startswith("crate.xml lies outside the folders this server may read models from")
     assert str(tmp_path) not in said
 
@@ -188,7 +190,10 @@ def test_names_that_are_not_those_of_models_are_refused(http: TestClient, name: 
 def test_a_damaged_archive_is_refused_with_a_reason(http: TestClient) -> None:
     broken = bytearray(CRATE)
     broken[60] ^= 0xFF  # in the first file: its checksum is wrong now
-    assert "Bad CRC-32" in refusal(http.put("/api/models/crate.zip", content=bytes(broken)))
+    said = refusal(http.put("/api/models/crate.zip", content=bytes(broken)))
+    assert "Bad CRC-32" in said
+    last = http.get("/api/log").json()[-1]
+    assert (last["kind"], last["what"], last["text"]) == ("error", "import model", f"crate.zip: {said}")
     assert "not a ZIP archive" in refusal(http.put("/api/models/crate.zip", content=b"nonsense"))
 
 

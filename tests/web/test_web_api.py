@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import re
+import time
 from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from starlette.applications import Starlette
 from starlette.routing import Mount
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
-from waiting import attempts
+from waiting import attempts, eventually
 
 from urlab_client.aio import URLabClient
 from urlab_client.console import mujoco_viewer
@@ -190,6 +191,8 @@ def test_asyncapi_describes_every_message_of_the_websockets(http: TestClient) ->
             seen.add(message["type"])
             if message["type"] == "refused":
                 assert "shout" in message["error"]["message"]
+            elif message["type"] == "pong":
+                assert (message["at"], message["now"]) == (1.0, pytest.approx(1e3 * time.time(), abs=60e3))
             if seen == {"you", "world", "state", "status", "log", "refused", "pong"}:
                 break
     with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
@@ -329,7 +332,8 @@ def test_one_drives_and_the_others_wait(http: TestClient) -> None:
         http.websocket_connect("ws://localhost/api/live") as one,
         http.websocket_connect("ws://localhost/api/live") as two,
     ):
-        first, second = ({"x-urlab-viewer": heard(live, "you")["viewer"]} for live in (one, two))
+        found = [heard(live, "you") for live in (one, two)]
+        names, (first, second) = [you["name"] for you in found], [{"x-urlab-viewer": you["viewer"]} for you in found]
         assert http.post("/api/lease", headers=first).json()["mine"]
         refused = http.post("/api/ops/reset", json={}, headers=second)
         assert (refused.status_code, refused.json()["error"]["code"]) == (423, "not_driving")
@@ -339,8 +343,15 @@ def test_one_drives_and_the_others_wait(http: TestClient) -> None:
         assert not status["mine"]
         assert http.post("/api/ops/list_keyframes", json={}, headers=second).status_code == 200
         assert http.post("/api/run", json={"running": False}, headers=second).status_code == 200, "everybody may stop"
+        assert http.post("/api/lease", headers=second).status_code == 423
+        http.delete("/api/lease", headers=second)
+        assert http.post("/api/lease", headers=first).json()["mine"]
         http.delete("/api/lease", headers=first)
         assert http.post("/api/ops/reset", json={}, headers=second).status_code == 200
+        log = [(one["who"], one["what"]) for one in http.get("/api/log").json() if "controls" in one["what"]]
+        assert log[-2:] == [(names[0], "take the controls"), (names[0], "release the controls")], (
+            "and nothing that failed"
+        )
 
 
 @pytest.mark.opengl
@@ -353,10 +364,10 @@ def test_direct_mode_steps_and_shows_what_cameras_see(http: TestClient) -> None:
         with http.websocket_connect("ws://localhost/api/live") as live:
             heard(live, "state", lambda state: state["step"] > 30)
         with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
-            frame = camera.receive_bytes()
-        length = int.from_bytes(frame[:4], "little")
-        assert json.loads(frame[4 : 4 + length])["mode"] == "real"
-        assert Image.open(io.BytesIO(frame[4 + length :])).size == (64, 48)
+            (first, _), (second, jpeg) = picture_in(camera), picture_in(camera)
+        assert second["mode"] == "real"
+        assert second["received"] > first["received"]
+        assert Image.open(io.BytesIO(jpeg)).size == (64, 48)
         http.post("/api/run", json={"running": False})
         assert http.post("/api/step", json={"n_steps": -1}).status_code == 400
     finally:
@@ -412,9 +423,14 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         http.post("/api/ctrl", json={"arm": {"elbow": -0.4}})
         for _ in range(10):
             http.post("/api/step", json={"n_steps": 100})
+        eventually(
+            lambda: http.get("/api/status").json()["recording"]["seconds"] == 1.8
+        )  # of its clock, like the length
         made = http.delete("/api/recording").json()
         assert made["seconds"] == pytest.approx(1.8, abs=0.01), "ten steps of 0.2 s, of which each is one state"
         assert (made["robots"], made["damage"], made["lost"]) == (["arm"], "", 0)
+        noted = [entry["text"] for entry in http.get("/api/log").json() if entry["what"] == "record"]
+        assert noted[0] == name
         assert http.get("/api/recordings").json()["recordings"][0]["name"] == name
 
         file = tmp_path / name
@@ -455,15 +471,21 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         http.post("/api/replay", json={"time": 0.0, "playing": True, "rate": 4})
         with http.websocket_connect("ws://localhost/api/live") as viewer:
             heard(viewer, "status", lambda status: status["replay"]["playing"] and status["rate"] == 4)
+            assert heard(viewer, "state")["recorded"]
             ended = heard(viewer, "status", lambda status: not status["replay"]["playing"])
             assert ended["replay"]["time"] == pytest.approx(1.8, abs=0.01)
             http.delete("/api/replay")
             http.post("/api/step", json={"n_steps": 1})
-            heard(viewer, "state", lambda state: elbow(state) == pytest.approx(live, abs=0.01))
+            heard(
+                viewer, "state", lambda state: elbow(state) == pytest.approx(live, abs=0.01) and not state["recorded"]
+            )
 
         http.post("/api/replay", json={"name": name, "placing": True, "playing": False})
         assert http.get("/api/status").json()["mode"] == "puppet"
-        http.post("/api/replay", json={"time": 0.0})
+        for wanted, row in ((1.0, 5), (0.0, 0), (0.39, 1)):
+            http.post("/api/replay", json={"time": wanted})
+            placed = http.post("/api/ops/forward", json={}).json()["per_articulation"]["arm"]["qpos"][place]
+            assert placed == pytest.approx(recorded[row], abs=1e-4)
         http.delete("/api/replay")
         assert http.get("/api/status").json()["mode"] == "direct"
         reached = http.post("/api/ops/forward", json={}).json()["per_articulation"]["arm"]["qpos"][place]
@@ -477,6 +499,13 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
             picture_of(watching, pictures[-1].time - table.time[0])
         http.delete("/api/replay")
         http.delete("/api/recordings/late.mcap")
+
+        cut = http.put("/api/recordings/cut.mcap", content=file.read_bytes()[:-100])
+        assert cut.json()["damage"] == "the end of the file is missing"
+        assert http.post("/api/replay", json={"name": "cut.mcap"}).json()["damage"] == cut.json()["damage"]
+        assert http.post("/api/replay", json={"name": name}).json()["damage"] == ""
+        http.delete("/api/replay")
+        http.delete("/api/recordings/cut.mcap")
 
         taken = http.put("/api/recordings/other.mcap", content=file.read_bytes())
         assert taken.json()["seconds"] == made["seconds"]

@@ -140,6 +140,10 @@ def test_steps_and_reset_in_direct_mode(page: Page) -> None:
     page.click("#step")
     page.until("document.querySelector('#time').textContent === '0.10 s'")
     page.choose("#mode", "live")
+    page.until("document.querySelector('#step').disabled")
+    page.until("document.querySelector('#age').innerText === 'paused'")
+    assert not page.look(RUNNING), "nobody pressed Play"
+    page.click("#play")
     page.until(RUNNING)
 
 
@@ -256,6 +260,14 @@ def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: 
     run = read_run(file)
     start, end = run.time_range()
     times = [picture.time - start for picture in run.frames("arm/overview") if picture.time < end + 1e-6]
+    page.click("#stop")
+    page.until(f"!({RUNNING})")
+    shown = page.look(
+        "(one => [one.dataset.sensor, one.querySelector('.signal').children[1].textContent])"
+        "(document.querySelector('.curve'))"
+    )
+    before = page.curve(*shown)
+    assert len({*before}) > 1
     page.click("[data-recording] .replay")
     page.until("!document.querySelector('#replay').hidden && +document.querySelector('#timeline').value > 0.1")
     page.until("document.querySelector('#time').textContent !== '0.00 s'")
@@ -282,6 +294,7 @@ def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: 
     page.click("#replay-end")
     page.until("document.querySelector('#replay').hidden")
     assert not page.look(RUNNING), "it was stopped, and what the replay showed was not its time"
+    assert page.curve(*shown) == before, "what came before the replay is back"
     page.click("#play")
     page.until(RUNNING)
     remove = page.find("[data-recording] button[aria-label^=Delete]")
@@ -374,6 +387,53 @@ def test_curves_can_be_added_read_hidden_and_held(page: Page) -> None:
     page.until(f"{read} !== '{held}'")
     page.click('[data-sensor="arm/qpos/rad"] .tiny')
     page.until(f"{curve} === null")
+
+
+def test_held_curves_outlive_a_reset(page: Page) -> None:
+    page.until(RUNNING)
+    for target in (0.0, 0.9):
+        page.slide(target)
+        page.until(page.elbow_is(target))
+    page.driver.execute_script(
+        "const add = document.querySelector('#add-curve'); add.value = 'arm/qpos/rad';"
+        "add.dispatchEvent(new Event('change', {bubbles: true}))"
+    )
+    page.until("document.querySelector('[data-sensor=\"arm/qpos/rad\"]') !== null")
+    page.click("#stop")
+    page.until(f"!({RUNNING})")
+    page.click("#pause-curves")
+    held = page.curve("arm/qpos/rad", "elbow")
+    assert max(held) > 0.5
+    page.click("#reset")
+    page.until("document.querySelector('#time').textContent === '0.00 s'")
+    page.until(page.elbow_is(0.0))
+    assert max(page.curve("arm/qpos/rad", "elbow")) == pytest.approx(max(held), abs=0.1)
+    page.click("#pause-curves")
+    page.click("#play")
+    page.until(RUNNING)
+    page.until("parseFloat(document.querySelector('#time').textContent) > 0.5")
+    assert max(page.curve("arm/qpos/rad", "elbow")) < 0.5
+    page.click('[data-sensor="arm/qpos/rad"] .tiny')
+
+
+def test_a_curve_that_is_added_has_a_past(page: Page) -> None:
+    page.until(RUNNING)
+    for target in (0.0, 0.9):
+        page.slide(target)
+        page.until(page.elbow_is(target))
+    page.click("#stop")
+    page.until(f"!({RUNNING})")
+    page.driver.execute_script(
+        "const add = document.querySelector('#add-curve'); add.value = 'arm/qpos/rad';"
+        "add.dispatchEvent(new Event('change', {bubbles: true}))"
+    )
+    page.until("document.querySelector('[data-sensor=\"arm/qpos/rad\"]') !== null")
+    past = page.curve("arm/qpos/rad", "elbow")
+    assert min(past) < 0.1
+    assert max(past) > 0.5
+    page.click('[data-sensor="arm/qpos/rad"] .tiny')
+    page.click("#play")
+    page.until(RUNNING)
 
 
 def test_the_log_is_for_people_and_every_control_has_a_name_and_a_size(page: Page) -> None:
@@ -482,7 +542,7 @@ def test_a_killed_server_shows_as_such_and_comes_back(
     stack.close()  # kills it
     page.until("!document.querySelector('#banner').hidden && document.body.dataset.link === 'lost'")
     page.until("['#play', '#stop'].every((one) => document.querySelector(one).disabled)")
-    page.until("document.querySelector('#log').innerText.includes('The server is unreachable.')")
+    page.until("document.querySelector('#log').innerText.includes('The server is unreachable. Retrying.')")
     page.until("document.body.classList.contains('stale')")
     page.until("document.querySelector('#announcements').textContent.includes('unreachable')")
     assert page.look(place) == before, "what the page says must not move a slider from under a finger"
@@ -491,6 +551,8 @@ def test_a_killed_server_shows_as_such_and_comes_back(
     ports = [f"--{n}-port={ready[f'{n}_port']}" for n in ("step", "state", "ctrl", "info", "camera")]
     stack.enter_context(serve(*ports))
     page.until("document.body.dataset.link === 'connected' && document.querySelector('#banner').hidden")
+    page.until("document.querySelector('#log').innerText.includes('this is a new session')")
+    assert "Another program" not in page.look("document.querySelector('#log').innerText")
     assert page.look(place) == before
     page.until(RUNNING)
     page.slide(0.4)

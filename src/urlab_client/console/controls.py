@@ -38,7 +38,15 @@ from urlab_client.protocol.messages.runtime import (
     SetSimSpeed,
     SetTwist,
 )
-from urlab_client.protocol.messages.session import ArticulationCommand, Forward, Hello, Reset, Step
+from urlab_client.protocol.messages.session import (
+    ArticulationCommand,
+    ArticulationState,
+    Forward,
+    Hello,
+    Reset,
+    ResetOk,
+    Step,
+)
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, StopPie, StopPieOk
 from urlab_client.protocol.registry import OPS
 
@@ -51,6 +59,7 @@ SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is n
 """The ops that viewers may perform, by name; the console itself holds the session."""
 
 _PERIOD_S = 1 / 60
+_BURST_S = 5.0
 _FREQUENCY, _DAMPING = 40.0, 0.4
 """Frequency in rad/s and damping ratio of a joint that holds its pose."""
 
@@ -92,6 +101,7 @@ class Controls:
         before_step: Callable[[], None],
     ) -> None:
         self.running: bool = False
+        self._suspended = False
         self.speed: float | None = None
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
@@ -103,12 +113,22 @@ class Controls:
         self._before_step = before_step
         self._wake_runner = asyncio.Event()
         self._seeded: set[str] = set()
+        self._driven: dict[str, str] = {}  # the session in which viewers gave a robot set-points
+        self._driving: dict[tuple[str, ...], float] = {}
         self._pending: set[str] = set()
         self._commanded = asyncio.Event()
         self._pictures_due = 0.0
 
-    def begin_anew(self) -> None:
-        """Discard the state of the previous play session."""
+    def begin_anew(self, *, ended: bool) -> None:
+        """Discard the state of the previous play session; its set-points would drive the robots of the next.
+
+        Args:
+            ended: Whether it is the one that still was; otherwise set-points may have come for the next already.
+        """
+        for key, session in [*self._driven.items()]:
+            if ended or session != self._client.session_id:
+                self._forget(key)
+        self._suspended = False
         self._seeded.clear()
         self.twists.clear()
         self.holding.clear()
@@ -120,6 +140,8 @@ class Controls:
     async def do(self, viewer: Viewer, request: Request[Any]) -> object:
         """Perform an op for a viewer."""
         op = op_of(request)
+        if isinstance(request, StopPie):
+            self.running = False  # before a step meets no simulation
         if isinstance(request, SetPaused) and request.paused:
             self._lease.interrupt(viewer)  # any viewer may stop
         elif op.effect is not Effect.READ:
@@ -134,10 +156,10 @@ class Controls:
         if op.effect is not Effect.READ:
             given = {name: value for name, value in structs.asdict(request).items() if name != "session_id"}
             self._view.note("call", viewer.name, op.name, encode(given).decode(), 1e3 * (time.perf_counter() - began))
-        self._follow(request, reply)
+        self._follow(viewer, request, reply)
         return reply
 
-    def _follow(self, request: Request[Any], reply: Any) -> None:
+    def _follow(self, viewer: Viewer, request: Request[Any], reply: Any) -> None:
         """Remember settings that the server does not report."""
         match request:
             case SetSimSpeed():
@@ -147,16 +169,35 @@ class Controls:
             case SetTwist():
                 self.twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
             case SetMode() if reply.current_mode != StepMode.DIRECT:
-                self.holding.clear()
+                for key in [*self.holding]:
+                    self._let_go(viewer, key)
+            case Reset():
+                self._start_again(reply)
             case ConfigureController():
                 self._view.describe_world()
             case _:
                 pass
 
-    def set_points(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
+    def _start_again(self, reply: ResetOk) -> None:
+        """After a reset, command the pose and the forces of its start, as MuJoCo does, and no earlier set-points."""
+        for key in self._driven.keys() - self.holding.keys():
+            self._forget(key)
+            if art := self._client.articulations.get(key):
+                _keep(art, reply.per_articulation.get(key))
+                self._pending.add(key)
+                self._commanded.set()
+
+    def _forget(self, key: str) -> None:
+        """Discard a robot's set-points."""
+        del self._driven[key]
+        self._pending.discard(key)
+        if art := self._client.articulations.get(key):
+            art.ctrl_array[:] = 0.0
+
+    def set_points(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]], *, noted: bool = True) -> None:
         """Set set-points by articulation and actuator, or none if a name is unknown.
 
-        In live mode the newest are sent immediately.
+        In live mode the newest are sent immediately. The log says once who sets which, while they follow one another.
         """
         robots = self._client.articulations
         found = [(robots.key(name), robots[name], given) for name, given in values.items()]
@@ -165,11 +206,21 @@ class Controls:
                 art.actuators[name]  # raises
         self._lease.use(viewer)
         for key, art, given in found:
-            self.holding.pop(key, None)
+            self._let_go(viewer, key)
             self._seed(key, art)
             art.set_ctrl(given)
+            self._driven[key] = self._client.session_id
             self._pending.add(key)
+            if noted and given:
+                self._note_driving(viewer, key, *given)
         self._commanded.set()
+
+    def _note_driving(self, viewer: Viewer, key: str, *names: str) -> None:
+        now, what = time.monotonic(), (viewer.key, key, *names)
+        self._driving = {known: at for known, at in self._driving.items() if now - at < _BURST_S}
+        if what not in self._driving:
+            self._view.note("call", viewer.name, "set-points", encode({key: names}).decode())
+        self._driving[what] = now
 
     async def hold(self, viewer: Viewer, name: str, holding: bool) -> None:
         """Make a robot with torque motors hold its home pose, or let it go.
@@ -182,8 +233,17 @@ class Controls:
             if self._client.step_mode is not StepMode.DIRECT:
                 await self.do(viewer, SetMode(mode=StepMode.DIRECT))
             self.holding[key] = hold
-        elif (held := self.holding.pop(key, None)) is not None:
+        else:
+            self._let_go(viewer, key)
+
+    def _let_go(self, viewer: Viewer, key: str) -> None:
+        """End the torques that hold a robot's pose, if any do."""
+        held = self.holding.pop(key, None)
+        if held is not None:
             held.let_go()
+            self._pending.add(key)
+            self._commanded.set()
+            self._view.note("call", viewer.name, "let go", key)
 
     def _seed(self, key: str, art: URLabArticulation) -> None:
         """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
@@ -191,14 +251,8 @@ class Controls:
             return
         self._seeded.add(key)
         state = None if self._view.snapshot is None else self._view.snapshot.per_articulation.get(key)
-        if state is None or art.ctrl_array.any():
-            return
-        for actuator in art.actuators.values():
-            at = actuator.ctrl_local
-            if art.controller is not None and actuator.joint is not None:
-                actuator.set_control(float(state.qpos[art.joints[actuator.joint].qpos_local_offset]))
-            elif state.ctrl is not None:
-                art.ctrl_array[at] = state.ctrl[at]
+        if not art.ctrl_array.any():
+            _keep(art, state)
 
     async def send_set_points(self) -> None:
         """Send set-points in live mode, one request at a time."""
@@ -253,6 +307,9 @@ class Controls:
             self._lease.use(viewer)
         else:
             self._lease.interrupt(viewer)
+        if running and self._client.step_mode not in (StepMode.LIVE, StepMode.DIRECT):
+            raise ValueError(f"in mode {self._client.step_mode} no physics runs: choose live or direct")
+        self._suspended = False
         if self._client.step_mode is StepMode.LIVE:
             await self.do(viewer, SetPaused(paused=not running))
         else:
@@ -261,10 +318,25 @@ class Controls:
             self._wake_runner.set()
         self._view.notify()
 
+    def suspend(self) -> None:
+        """Take no steps until `resume`."""
+        self._suspended, self.running = self._suspended or self.running, False
+
+    def resume(self) -> None:
+        """Step again if steps were taken before `suspend`, and nobody has stopped or begun them since."""
+        if self._suspended and self._client.step_mode is StepMode.DIRECT:
+            self.running = True
+            self._wake_runner.set()
+            self._view.notify()
+        self._suspended = False
+
     async def keep_stepping(self) -> None:
         """Step in real time in direct mode while `running`; missed steps are not made up for."""
         while True:
             if not self.running or self._client.step_mode is not StepMode.DIRECT:
+                if self.running:  # until another mode was chosen
+                    self.running = False
+                    self._view.notify()
                 self._wake_runner.clear()
                 await self._wake_runner.wait()
                 continue
@@ -278,6 +350,18 @@ class Controls:
             finally:
                 self.running = self.running and stepped
             await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
+
+
+def _keep(art: URLabArticulation, state: ArticulationState | None) -> None:
+    """Set the set-points that keep a robot as it is: its pose if the server controls it, otherwise what was applied."""
+    if state is None:
+        return
+    for actuator in art.actuators.values():
+        at = actuator.ctrl_local
+        if art.controller is not None and actuator.joint is not None:
+            actuator.set_control(float(state.qpos[art.joints[actuator.joint].qpos_local_offset]))
+        elif state.ctrl is not None:
+            art.ctrl_array[at] = state.ctrl[at]
 
 
 class _PoseHold:

@@ -71,7 +71,7 @@ class ControllerView(Struct):
 
 
 class ArticulationView(Struct):
-    """One articulation."""
+    """One articulation; `height` is that of a free base in the keyframe `home`, or at the model's start, metres."""
 
     key: str
     actor_id: str
@@ -80,6 +80,7 @@ class ArticulationView(Struct):
     sensors: list[SensorView]
     cameras: list[CameraDescription]
     controller: ControllerView | None
+    height: float | None = None
 
 
 class WorldDescription(Struct):
@@ -129,6 +130,7 @@ def _articulation(client: URLabClient, art: URLabArticulation) -> ArticulationVi
         controller=None
         if controller is None
         else ControllerView(str(controller.kind), dict(controller.params), dict(controller.schema)),
+        height=_height(client.model, art),
     )
 
 
@@ -148,6 +150,13 @@ def _actuator(client: URLabClient, art: URLabArticulation, actuator: Actuator) -
         home = float(home_of(model, art)[int(model.jnt_qposadr[joint.id])])
     place = actuator.ctrl_local.start
     return ActuatorView(said.name, place, said.kind, said.joint, said.takes, said.unit, limits, home)
+
+
+def _height(model: mujoco.MjModel | None, art: URLabArticulation) -> float | None:
+    free = next((joint for joint in art.joints.values() if joint.kind == "free"), None)
+    if model is None or free is None:
+        return None
+    return float(home_of(model, art)[int(model.jnt_qposadr[free.id]) + 2])
 
 
 def home_of(model: mujoco.MjModel, art: URLabArticulation) -> Any:

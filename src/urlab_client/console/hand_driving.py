@@ -48,6 +48,8 @@ class HandDriving:
         if any((*order.linear, *order.angular, order.gripper)):
             self._lease.use(viewer)
             self._hand(viewer, order.articulation, order.site)
+            if order.articulation not in self._orders:
+                self._view.note("call", viewer.name, "drive hand", order.articulation)
             self._orders[order.articulation] = time.monotonic(), viewer, order
             self._ordered.set()
         else:
@@ -84,7 +86,7 @@ class HandDriving:
             hand.hold()
         self._moving.add(key)
         hand.drive(order.linear, order.angular, order.gripper, dt=seconds)
-        self._controls.set_points(viewer, {key: hand.set_points})
+        self._controls.set_points(viewer, {key: hand.set_points}, noted=False)
 
     def _elsewhere(self, hand: HandControl) -> bool:
         """Whether something else has moved the hand since, or set its set-points: a reset, a slider, a policy."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypeAlias, cast
 
 import msgspec
@@ -60,7 +60,7 @@ class ArticulationSample(Struct):
     qvel: Numbers
     ctrl: Numbers | None
     sensors: dict[str, Numbers | None]
-    targets: list[float] | None
+    targets: Sequence[float | None] | None
 
 
 class EntitySample(Struct):
@@ -70,7 +70,10 @@ class EntitySample(Struct):
 
 
 class State(Struct, tag_field="type", tag="state"):
-    """The newest state, at most 60 per second. `time` is simulation time in seconds, `made` Unix time in ms."""
+    """The newest state, at most 60 per second. `time` is simulation time in seconds, `made` Unix time in ms.
+
+    If `recorded` is true, the state is part of the replayed recording, and `time` is on that recording's clock.
+    """
 
     seq: int
     time: float
@@ -78,10 +81,11 @@ class State(Struct, tag_field="type", tag="state"):
     made: float
     articulations: dict[str, ArticulationSample]
     entities: dict[str, EntitySample]
+    recorded: bool = False
 
 
 class RunningRecording(Struct):
-    """The recording that is under way: its file's name, seconds of real time, states and pictures so far, bytes.
+    """The recording that is under way: its file's name, length so far in seconds of its clock, states, pictures, bytes.
 
     `failed` says that it can no longer be written.
     """
@@ -107,7 +111,7 @@ class ReplayView(Struct):
     """Position of a replay, in seconds of the recording's clock. `placing`: whether the simulation's robots follow.
 
     `alone`: whether there is no simulation besides. `cameras` lists the cameras whose recorded pictures are shown, as
-    `ARTICULATION/CAMERA` or `-/CAMERA`.
+    `ARTICULATION/CAMERA` or `-/CAMERA`. `damage`: why the file ends early, if it does.
     """
 
     name: str
@@ -118,6 +122,7 @@ class ReplayView(Struct):
     placing: bool
     alone: bool
     cameras: list[str]
+    damage: str
 
 
 class Status(Struct, tag_field="type", tag="status"):
@@ -233,7 +238,9 @@ class PictureHead(Struct):
 _DIGITS = 5
 
 
-def state_message(seq: int, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> State:
+def state_message(
+    seq: int, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None], *, recorded: bool = False
+) -> State:
     """Return the message of a state, with what viewers have commanded by articulation."""
     wall = snapshot.wall_time.sec + snapshot.wall_time.nsec / 1e9
     received = snapshot.recv_wall_time_ns / 1e9
@@ -255,6 +262,7 @@ def state_message(seq: int, snapshot: StateSnapshot, targets: Mapping[str, list[
             for key, state in snapshot.per_articulation.items()
         },
         entities={name: EntitySample(rounded(pose.xpos)) for name, pose in snapshot.entities.items()},
+        recorded=recorded,
     )
 
 

@@ -7,7 +7,6 @@ import os
 import re
 import secrets
 import tempfile
-import time
 from collections.abc import AsyncGenerator, AsyncIterator
 from datetime import datetime
 from pathlib import Path
@@ -67,7 +66,6 @@ class Recordings:
         self.conversions: list[Conversion] = []
         self._client = client
         self._recorder: AsyncRecorder | None = None
-        self._began = 0.0
         self._open = contextlib.AsyncExitStack()
         self._changing = anyio.Lock()
         self._described: dict[str, tuple[float, RecordingContents]] = {}
@@ -78,10 +76,9 @@ class Recordings:
         if self._recorder is None:
             return None
         stats = self._recorder.stats
-        seconds = time.monotonic() - self._began
         return RunningRecording(
             self._recorder.path.name,
-            round(seconds, 1),
+            round(stats.duration_s, 1),
             stats.states,
             stats.frames,
             stats.file_bytes,
@@ -108,7 +105,7 @@ class Recordings:
                 camera_hz=_CAMERA_HZ,
                 pose_hz=0.0 if self._client.model is None else 50.0,
             )
-            self._recorder, self._began = await self._open.enter_async_context(recorder), time.monotonic()
+            self._recorder = await self._open.enter_async_context(recorder)
             return path.name
 
     async def mark(self, outcome: EpisodeOutcome) -> None:

@@ -100,6 +100,7 @@ class Replay:
             self._before is not None,
             self.alone,
             [] if self._before is not None else sorted(self.cameras),
+            self._run.damage,
         )
 
     @property
@@ -254,7 +255,7 @@ class Replay:
             self._state = state
             robots = _present(state, self._robots)
             targets = {key: values.set_points.tolist() for key, values in robots.items() if len(values.set_points)}
-            self._view.show(state.snapshot(state.time - self._start, robots), targets)
+            self._view.show(state.snapshot(state.time - self._start, robots), targets, recorded=True)
 
     async def _show_pictures(self) -> None:
         """Show recorded pictures; those of the simulation while its robots are placed, too."""
@@ -269,9 +270,11 @@ class Replay:
         self._before = _Before(mode, data.qpos.copy(), data.qvel.copy())
 
     async def _place(self) -> None:
-        """Place the simulation's robots as recorded."""
+        """Place the simulation's robots as recorded; while they move, only so often."""
         model, data = self._client.model, self._client.data
-        if self._before is None or model is None or data is None or time.monotonic() - self._placed_at < _PLACED_S:
+        if self._before is None or model is None or data is None:
+            return
+        if self._playing and time.monotonic() - self._placed_at < _PLACED_S:
             return
         self._placed_at = time.monotonic()
         prefixes = compiled_prefixes(self._client.articulations)

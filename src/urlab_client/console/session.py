@@ -27,7 +27,7 @@ from urlab_client.console.messages import Link, Status, encode, rounded
 from urlab_client.console.mujoco_viewer import MujocoViewer
 from urlab_client.console.pictures import Cameras
 from urlab_client.console.recordings import Recordings
-from urlab_client.console.replay import Replay
+from urlab_client.console.replay import Replay, recorded_handshake
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError
@@ -91,7 +91,7 @@ class ConsoleSession:
         self.hands: HandDriving = HandDriving(client, lease, self.controls, view)
         self._handshake = handshake
         self._adopted = b""
-        self._agents = 0
+        self._agents = self._seen = 0
         self._want: str | None = "discover"
         self._wake = asyncio.Event()
         self._connecting = anyio.Lock()
@@ -128,9 +128,42 @@ class ConsoleSession:
                     await self.recordings.end()
 
     async def _begin_replay(self) -> None:
-        if self._replayed is not None:
-            await self.opened()
-            await self.replay.begin(self._replayed)
+        """Show a recording from its start, once somebody watches."""
+        if self._replayed is None:
+            return
+        await self.opened()
+        await self.replay.begin(self._replayed)
+        await self.replay.change(at=0.0, playing=False)
+        with self.view.watch() as changed:
+            while not self.viewers:
+                changed.clear()
+                await changed.wait()
+        if not self.replay.at:
+            await self.replay.change(playing=True)
+
+    async def begin_replay(self, file: Path, *, placing: bool = False) -> None:
+        """Show a recording; without a simulation, also one of other robots."""
+        if self.replay.alone:
+            from urlab_client.integrations.record import read_run
+
+            handshake = await anyio.to_thread.run_sync(lambda: recorded_handshake(read_run(file)))
+            await self.replay.end()
+            async with self._connecting:
+                self._handshake = lambda: handshake
+                await self._discover()
+            self._begin_anew()
+        if placing:
+            self.controls.suspend()
+        try:
+            await self.replay.begin(file, placing=placing)
+        finally:
+            if not (self.replay.view and self.replay.view.placing):
+                self.controls.resume()
+
+    async def end_replay(self) -> None:
+        """Show the simulation again, as it was before a replay that moved it."""
+        await self.replay.end()
+        self.controls.resume()
 
     async def _run(self, job: Callable[[], Awaitable[None]]) -> None:
         """Run a job for as long as the console is open. Its failure is not that of the application around it."""
@@ -234,7 +267,7 @@ class ConsoleSession:
                     self._ask_for("discover")
             case PlayEnded() | SessionOpened():
                 self.controls.running = False
-                self._begin_anew()
+                self._begin_anew(ended=isinstance(event, PlayEnded))
             case _:
                 pass
 
@@ -244,9 +277,9 @@ class ConsoleSession:
             self.link = Link(state, reason, self.link.since if away else time.time())
             self.view.notify()
 
-    def _begin_anew(self) -> None:
+    def _begin_anew(self, *, ended: bool = False) -> None:
         """Discard the state of the previous play session."""
-        self.controls.begin_anew()
+        self.controls.begin_anew(ended=ended)
         self.cameras.begin_anew()
         self.view.describe_world()
 
@@ -289,9 +322,8 @@ class ConsoleSession:
     @contextlib.contextmanager
     def new_viewer(self) -> Generator[Viewer]:
         """Yield a new viewer, who watches while the block runs."""
-        taken = {viewer.name for viewer in self.viewers.values()}
-        name = next(name for n in range(1, len(taken) + 2) if (name := f"Viewer {n}") not in taken)
-        viewer = Viewer(secrets.token_urlsafe(16), name)
+        self._seen += 1  # and none again: the log would call two of them the same
+        viewer = Viewer(secrets.token_urlsafe(16), f"Viewer {self._seen}")
         self.viewers[viewer.key] = viewer
         self.view.notify()
         try:
@@ -330,15 +362,19 @@ class ConsoleSession:
         holder = self.lease.holder
         return holder is not None and holder.key == viewer.key
 
+    @property
+    def running(self) -> bool:
+        """Whether physics runs, in live mode by itself, in direct mode stepped by the console."""
+        return self.moving if self.client.step_mode is StepMode.LIVE else self.controls.running
+
     def _present_status(self) -> Status:
         client, controls, replay, holder = self.client, self.controls, self.replay, self.lease.holder
-        live = client.step_mode is StepMode.LIVE
         return Status(
             link=self.link,
             address=client.address,
             playing=client.manager_present,
             moving=replay.rate > 0 if replay.open else self.moving,
-            running=self.moving if live else controls.running,
+            running=self.running,
             rate=replay.rate if replay.open else round(self._clock.rate, 3) if self.moving else 0.0,
             mode=client.step_mode,
             speed=controls.speed,

@@ -71,8 +71,9 @@ class SharedView:
 
     def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
         """Add a line to the log."""
+        text = text.removeprefix(f"{what}: ")  # as errors of the client begin
         if (kind, who) == ("error", "console"):
-            log.warning("%s: %s", what, text.removeprefix(f"{what}: "))
+            log.warning("%s: %s", what, text)
         self._n += 1
         self.entries.append(LogEntry(self._n, time.time(), kind, who, what, text, ms))
         self.notify()
@@ -82,11 +83,13 @@ class SharedView:
         missed = min(self._n - n, len(self.entries))  # they are numbered without gaps
         return [*islice(reversed(self.entries), max(0, missed))][::-1]
 
-    def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> None:
+    def show(
+        self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None], *, recorded: bool = False
+    ) -> None:
         """Show a state, and what viewers have commanded by articulation."""
         self.snapshot = snapshot
         self.state_seq += 1
-        self.state_json = encode(state_message(self.state_seq, snapshot, targets)).decode()
+        self.state_json = encode(state_message(self.state_seq, snapshot, targets, recorded=recorded)).decode()
         self.notify()
 
     def describe_world(self) -> None:

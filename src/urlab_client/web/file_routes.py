@@ -16,8 +16,9 @@ from starlette.types import Receive, Scope, Send
 from urlab_client.console.messages import ReplayView, State, state_message
 from urlab_client.console.model_import import WouldReplace, make_blueprint, receive_model
 from urlab_client.console.recordings import RecordingContents, RecordingView
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import EpisodeOutcome
-from urlab_client.web.endpoints import BYTES, JOB, Call, endpoint, json_response, refusal
+from urlab_client.web.endpoints import BYTES, JOB, Call, endpoint, explain_error, json_response, refusal
 
 _T = TypeVar("_T")
 
@@ -144,22 +145,25 @@ async def replay(call: Call, body: ReplayRequest) -> ReplayView:
     """Start a replay with `{name, placing}`, or change it with `{time, playing, rate}`, seconds."""
     replay = call.console.replay
     if body.name:
-        await replay.begin(call.console.recordings.path(body.name), placing=body.placing)
-        call.note("replay", body.name)
+        await call.console.begin_replay(call.console.recordings.path(body.name), placing=body.placing)
+        call.note("replay in the simulation" if body.placing else "replay", body.name)
     return await replay.change(at=body.time, playing=body.playing, rate=body.rate)
 
 
 @endpoint("DELETE", "/api/replay", drives=True)
 async def end_replay(call: Call) -> None:
     """End the replay and show the server's state again."""
-    await call.console.replay.end()
+    replay = call.console.replay
+    if replay.view is not None:
+        call.note("end replay", replay.view.name)
+    await call.console.end_replay()
 
 
 @endpoint("GET", "/api/replay/states")
 async def replayed(call: Call, seconds: float = 8.0) -> StateList:
     """States of the last `?seconds` before the replay's position."""
     states = await call.console.replay.past(seconds)
-    return StateList([state_message(n, state, {}) for n, state in enumerate(states)])
+    return StateList([state_message(n, state, {}, recorded=True) for n, state in enumerate(states)])
 
 
 @endpoint("PUT", "/api/models/{name}", reply=ImportedModel, upload=True)
@@ -172,12 +176,16 @@ async def import_model(call: Call, name: str, replace: str = "") -> Response:
     request.scope[JOB] = f"the import of {name}"
     async with console.lease.hold(call.viewer):  # large models take longer than the controls are kept
         await console.opened()
-        model = await receive_model(name, request.stream())
         try:
+            model = await receive_model(name, request.stream())
             made = await make_blueprint(console.client, name, model, replace)
         except WouldReplace as error:
             hint = f"Send it again with ?replace={error.name} to replace it."
             return refusal(409, "would_replace", str(error), hint, name=error.name)
+        except (URLabError, ValueError) as error:
+            said = explain_error(error)[1]["message"]
+            console.view.note("error", call.viewer.name, "import model", f"{name}: {said}")
+            raise
     call.note("import model", name)
     return json_response(ImportedModel(made.class_path, made.short_name))
 

@@ -210,10 +210,17 @@ async def step_many(call: Call, body: StepRequest = _ONE_STEP) -> SteppedTo:
 
 @endpoint("POST", "/api/hold", drives=True)
 async def hold(call: Call, body: dict[str, bool]) -> None:
-    """Hold the home pose with torque motors, in direct mode, until set-points come: `{articulation: holding}`."""
+    """Hold the home pose with torque motors, in direct mode, until set-points come: `{articulation: holding}`.
+
+    Physics that runs goes on.
+    """
+    controls, running = call.console.controls, call.console.running
     for key, holding in body.items():
-        await call.console.controls.hold(call.viewer, key, holding)
-        call.note("hold pose" if holding else "let go", key)
+        await controls.hold(call.viewer, key, holding)
+        if holding:
+            call.note("hold pose", key)
+    if running and controls.holding and not controls.running:
+        await controls.run(call.viewer, True)
 
 
 # Bodies
@@ -252,9 +259,13 @@ async def end_push(call: Call) -> None:
 # Viewers
 
 
-@endpoint("POST", "/api/lease", drives=True)
+@endpoint("POST", "/api/lease")
 async def take_controls(call: Call) -> Status:
-    """Take or keep the controls."""
+    """Take or keep the controls: status 423 while another viewer has them."""
+    before = call.console.lease.holder
+    call.console.lease.use(call.viewer)
+    if before is None or before.key != call.viewer.key:
+        call.note("take the controls", "")
     call.console.view.notify()
     return call.console.status(call.viewer)
 
@@ -262,7 +273,10 @@ async def take_controls(call: Call) -> Status:
 @endpoint("DELETE", "/api/lease")
 async def release_controls(call: Call) -> Status:
     """Release the controls."""
+    holder = call.console.lease.holder
     call.console.lease.release(call.viewer)
+    if holder is not None and holder.key == call.viewer.key:
+        call.note("release the controls", "")
     call.console.view.notify()
     return call.console.status(call.viewer)
 

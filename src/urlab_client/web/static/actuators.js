@@ -1,6 +1,6 @@
 // Rows of the joint panel: an actuator's set-point as slider and number, beside the measured joint position.
 
-import { h, number, text } from "./dom.js";
+import { h, number, text, toast } from "./dom.js";
 import { setPoint } from "./link.js";
 
 const HELD_MS = 700;
@@ -39,7 +39,7 @@ export class ActuatorRow {
     this.slider = h("input", { type: "range", min: range[0], max: range[1], step: (range[1] - range[0]) / 1000, value: 0,
       "data-actuator": name, "aria-label": `${name} set-point${actuator.unit ? `, ${actuator.unit}` : ""}`, oninput: () => this.set(+this.slider.value) });
     this.box = h("input", { type: "number", step: "any", "data-set-point": name, "aria-label": `${name} set-point as a number`,
-      onchange: () => this.box.value !== "" && this.set(+this.box.value) });
+      onchange: () => this.box.value !== "" && this.type(+this.box.value) });
     this.mark = h("i", { class: "mark", title: this.follows ? "Joint position" : "Applied control" });
     this.measured = h("span", { class: "num", "data-value": name });
     this.held = -Infinity;
@@ -61,6 +61,13 @@ export class ActuatorRow {
     this.slider.value = within;
     this.write(within);
     setPoint(this.robot, this.actuator.name, within);
+  }
+
+  /** Set what was typed, and say where it ends. */
+  type(value) {
+    const [low, high] = this.actuator.range ?? [-Infinity, Infinity];
+    if (value < low || value > high) toast(`${this.actuator.name} goes from ${shortly(low)} to ${shortly(high)} ${this.actuator.unit}: ${shortly(value)} is out of reach.`);
+    this.set(value);
   }
 
   zero() {
@@ -111,22 +118,38 @@ const TURNS = ["hinge", "slide"];
 export const canHold = (art) => art.actuators.some((actuator) => actuator.takes === "force"
   && art.joints.some((joint) => joint.name === actuator.joint && TURNS.includes(joint.kind)));
 
-/** Whether a robot that stands on its own would collapse when physics runs, because nobody has commanded it yet. */
-export const limp = (art, state) => canHold(art) && !state?.targets && art.joints.some((joint) => joint.kind === "free")
-  && art.actuators.every((actuator) => !state?.ctrl?.[actuator.index]);
+/** What an actuator is given: what the console has commanded, or what was applied at the last step. */
+const given = (actuator, state) => (state?.targets ?? state?.ctrl)?.[actuator.index] ?? 0;
+
+const free = (art) => art.joints.find((joint) => joint.kind === "free");
+
+/** Whether a robot that stands on its own would collapse when physics runs, because nobody commands it. */
+export const limp = (art, state) => canHold(art) && free(art) !== undefined && art.actuators.every((actuator) => !given(actuator, state));
+
+/** Whether a robot lies on the ground: its base hangs low, or leans by more than 60°. */
+export function fallen(art, state) {
+  const base = free(art);
+  if (!base || !(art.height > 0) || !state?.qpos) return false;
+  const [z, , x, y] = state.qpos.slice(base.index + 2, base.index + 6);
+  return z < 0.6 * art.height || 1 - 2 * (x * x + y * y) < 0.5;
+}
 
 /** What holds a robot, or the reason why it does not move, as far as its state shows it; or an empty string. */
 export function stillness(art, state, status) {
-  if (status?.holding.includes(art.key)) return "It holds its home pose until you move a slider.";
+  if (status?.replay) return "";
+  if (status?.mode === "puppet") return "In mode puppet a program places it, and no physics runs.";
+  if (status?.holding.includes(art.key) && fallen(art, state)) return "It holds its home pose, but has fallen. Press Reset to.";
+  if (status?.holding.includes(art.key)) return `It holds its home pose ${status.moving ? "until you move a slider" : "as soon as physics runs"}.`;
   if (!art.actuators.length) return "It has no actuators: only gravity and contacts move it.";
   if (status?.source === "ui") return "The editor's panel drives it (control “ui”): set-points from here have no effect.";
   const limits = Object.values(art.controller?.params.torque_limit ?? {});
   if (limits.length && limits.every((limit) => limit === 0)) return "Its torque limits are 0, so nothing drives it. Raise them under “Gains”.";
   const forces = art.actuators.filter((actuator) => actuator.takes === "force");
-  if (forces.length === art.actuators.length && forces.every((actuator) => !state.ctrl?.[actuator.index])) {
+  if (canHold(art) && fallen(art, state)) return "It has fallen. “Reset and hold” stands it up.";
+  if (forces.length === art.actuators.length && forces.every((actuator) => !given(actuator, state))) {
     if (limp(art, state) && status?.moving) return "Nothing drives it, so it falls. “Hold pose” makes it stand.";
     return limp(art, state) ? "Nothing drives it yet. Play makes it hold its pose."
       : "Nothing drives it: all its forces are 0. Move a slider, or run a policy.";
   }
-  return "";
+  return canHold(art) && free(art) ? "Set-points drive it. “Hold pose” takes over." : "";
 }

@@ -5,12 +5,15 @@ import { ask, clock, on, op } from "./link.js";
 import { pauseReplay, toggleReplay } from "./replay.js";
 import { steady } from "./robots.js";
 
-export const now = { status: null, state: null, socket: false };
+export const now = { status: null, state: null, socket: false, opened: 0 };
 const ui = {};
+let ran = false; // whether physics runs, or did before mode puppet
 
 /** Whether simulation time stands still, and nothing is wrong with that. */
-export const paused = () => now.socket && now.status?.link.state === "connected" && !now.status.moving;
+export const paused = () => now.socket && now.status?.link.state === "connected" && !now.status.moving && !now.status.running;
 
+const STATE_DUE_MS = 5000;
+const RUN = "Run or pause physics (space)";
 const LINKS = {
   connected: "Connected",
   connecting: "Connecting",
@@ -35,6 +38,12 @@ export const reset = (keyframe) => op("reset", keyframe ? { keyframe_name: keyfr
 export const drive = () =>
   now.status?.mine ? ask("DELETE", "api/lease") : ask("POST", "api/lease");
 
+/** Choose a step mode; physics that stood still, before mode puppet as well, is paused at once in live mode. */
+async function choose(mode) {
+  const still = mode === "live" && !ran;
+  if ((await op("set_mode", { mode })) && still) await op("set_paused", { paused: true });
+}
+
 export async function toggleRun() {
   if (now.status?.replay) toggleReplay();
   else if (now.status) {
@@ -46,7 +55,7 @@ export async function toggleRun() {
 
 /** Stop whatever moves: physics, and a replay. */
 export function stop() {
-  run(false);
+  if (!now.status?.replay?.alone) run(false);
   if (now.status?.replay) pauseReplay();
 }
 
@@ -76,13 +85,13 @@ export function makeBar() {
   ui.age = h("b", { id: "age" }, "–");
   ui.time = h("b", { id: "time" }, "–");
   ui.rate = h("b", {}, "–");
-  ui.play = h("button", { class: "primary", id: "play", title: "Run or pause physics (space)", onclick: toggleRun }, "▶ Play");
+  ui.play = h("button", { class: "primary", id: "play", title: RUN, onclick: toggleRun }, "▶ Play");
   ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; anyone can (escape)", onclick: stop }, "■ Stop");
   ui.steps = h("input", { id: "steps", type: "number", min: 1, max: 10000, value: 10, title: "Steps at a time", "aria-label": "Steps at a time" });
   ui.step = h("button", { id: "step", title: "Step, in direct mode (.)", onclick: () => step(+ui.steps.value || 1) }, "Step");
   ui.keyframe = h("select", { id: "keyframe", "aria-label": "Keyframe" }, h("option", { value: "" }, "start"));
   ui.reset = h("button", { id: "reset", title: "Reset to the start or a keyframe (r)", onclick: () => reset(ui.keyframe.value) }, "Reset to");
-  ui.mode = h("select", { id: "mode", "aria-label": "Step mode", onchange: () => op("set_mode", { mode: ui.mode.value }) },
+  ui.mode = h("select", { id: "mode", "aria-label": "Step mode", onchange: () => choose(ui.mode.value) },
     ...["live", "direct", "puppet"].map((mode) => h("option", {}, mode)));
   ui.source = h("select", { id: "source", "aria-label": "Control source", title: "Which set-points drive: this client's (zmq) or the editor panel's (ui)",
     onchange: () => ui.source.value && op("set_control_source", { source: ui.source.value }) },
@@ -90,9 +99,11 @@ export function makeBar() {
   ui.speed = h("input", { id: "speed", type: "range", min: 5, max: 100, step: 5, value: 100, "aria-label": "Speed, percent of real time",
     onchange: () => op("set_sim_speed", { percent: +ui.speed.value }), oninput: () => text(ui.speedText, `${ui.speed.value} %`) });
   ui.speedText = h("span", { class: "num" }, "100 %");
-  ui.driver = h("span", { id: "driver", class: "pill" });
+  ui.who = h("span", {});
+  ui.others = h("span", { class: "others" });
+  ui.driver = h("span", { id: "driver", class: "pill" }, ui.who, ui.others);
   ui.drive = h("button", { id: "drive", title: "Take or release the controls (d)", onclick: drive }, "Take the controls");
-  ui.restart = confirmed({ id: "restart", title: "Begin play, or restart it" }, () => now.status?.playing ? "Restart play" : "Begin play",
+  ui.restart = confirmed({ id: "restart", title: "Begin a play session, or begin it anew; physics waits for Play" }, () => now.status?.playing ? "Restart play" : "Begin play",
     () => now.status?.playing && "Discard this simulation?", restartPlay);
 
   ui.sheet = h("button", { id: "sheet-toggle", "aria-expanded": "false", "aria-controls": "sheet", onclick: toggleSheet }, "Controls");
@@ -116,16 +127,25 @@ export function makeBar() {
       ui.driver,
       h("span", { class: "acts" }, ui.drive,
         h("button", { id: "invite", class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
-      h("button", { class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
+      h("button", { id: "keys", class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
     h("div", { class: "row controls acts" }, ui.play, ui.stop, ui.sheet, ui.more));
   const place = () => (PHONE.matches ? $("sheet").prepend(ui.more) : document.querySelector(".controls").append(ui.more));
   PHONE.addEventListener("change", place);
   place();
 
-  on("open", () => { now.socket = true; now.since = null; });
+  on("open", () => { now.socket = true; now.since = null; now.opened = Date.now(); });
   on("closed", () => { now.socket = false; now.since = now.since ?? Date.now(); show(now.status); banner(); });
-  on("status", (status) => { now.status = status; show(status); banner(); });
-  on("state", (state) => { now.state = state; });
+  on("status", (status) => {
+    now.status = status;
+    if (status.mode !== "puppet") ran = status.running;
+    show(status);
+    banner();
+  });
+  on("state", (state) => {
+    const first = !now.state;
+    now.state = state;
+    if (first) banner();
+  });
   on("world", async ({ world }) => {
     const answer = world.playing ? await op("list_keyframes", {}, { quiet: true }) : null;
     const names = (answer?.keyframes ?? []).map((key) => key.name).filter(Boolean);
@@ -139,7 +159,7 @@ export function makeBar() {
       ui.age.classList.toggle("old", !replayed && now.status?.moving && age > 1000);
       text(ui.time, `${now.state.time.toFixed(2)} s`);
     }
-    if (!now.socket || now.status?.link.state !== "connected") banner();
+    if (!now.socket || now.status?.link.state !== "connected" || !now.state) banner();
   }, 200);
 }
 
@@ -151,12 +171,13 @@ function show(status) {
   for (const part of [document.querySelector("main"), ...document.querySelectorAll("#bar .acts")]) part.inert = !now.socket;
   if (!status || !now.socket) return;
   document.body.classList.toggle("watching", !status.mine && status.driver !== null);
-  if (status.replay?.alone) text(ui.link, "Recording"); // there is no server to be connected with
+  if (status.replay?.alone) text(ui.link, "Recorded file"); // there is no server to be connected with
   text(ui.address, status.replay?.alone ? "" : status.address);
   const unreachable = ["lost", "connecting"].includes(link) && !status.replay;
-  text(ui.rate, unreachable ? "–" : status.moving ? `${status.rate.toFixed(2)}×` : "paused");
+  text(ui.rate, unreachable ? "–" : status.moving || status.running ? `${status.rate.toFixed(2)}×` : "paused");
   if (!unreachable) text(ui.play, (status.replay ? status.replay.playing : status.running) ? "❚❚ Pause" : "▶ Play");
-  ui.play.disabled = unreachable || (!status.playing && !status.replay);
+  ui.play.disabled = unreachable || (!status.replay && (!status.playing || status.mode === "puppet"));
+  ui.play.title = ui.play.disabled && status.mode === "puppet" ? "In mode puppet no physics runs: choose live or direct" : RUN;
   ui.stop.disabled = unreachable;
   ui.step.disabled = ui.steps.disabled = status.mode !== "direct";
   if (document.activeElement !== ui.mode) ui.mode.value = status.mode;
@@ -165,10 +186,9 @@ function show(status) {
     ui.speed.value = status.speed;
     text(ui.speedText, `${Math.round(status.speed)} %`);
   }
-  const others = status.viewers > 1 ? ` · ${status.viewers} viewers` : "";
-  text(ui.driver, status.driver === null ? `no driver${others}`
-    : status.mine ? `you drive · ${Math.ceil(status.lease_left)} s${others}`
-    : `${status.driver} drives · ${Math.ceil(status.lease_left)} s${others}`);
+  text(ui.others, status.viewers > 1 ? ` · ${status.viewers} viewers` : "");
+  text(ui.who, status.driver === null ? "no driver"
+    : `${status.mine ? "you drive" : `${status.driver} drives`} · ${Math.ceil(status.lease_left)} s`);
   ui.driver.dataset.who = status.mine ? "me" : status.driver === null ? "free" : "other";
   text(ui.drive, status.mine ? "Release" : "Take the controls");
   ui.drive.disabled = !status.mine && (unreachable || status.driver !== null);
@@ -177,6 +197,9 @@ function show(status) {
 
 /** A duration that does not flicker. */
 const whole = (ms) => duration(Math.max(1, Math.round(ms / 1000)) * 1000).replace(".0 s", " s");
+
+/** Whether the first state should have come, to the console and to this page. */
+const stateDue = (link) => Date.now() - Math.max(now.opened, link.since * 1000 - clock.offset) > STATE_DUE_MS;
 
 function banner() {
   const link = now.status?.link;
@@ -200,6 +223,8 @@ function banner() {
   } else if (now.status && !now.status.playing) {
     said = "No play session is running.";
     button = h("button", { onclick: restartPlay }, "Begin play");
+  } else if ((now.status?.mode === "live" || now.status?.running) && !now.state && !now.status.replay && stateDue(link)) {
+    said = "No state arrives. Does the server publish it at another port (--state-port)?";
   }
   document.body.classList.toggle("stale", !now.socket || (link && !["connected", "taken_over"].includes(link.state)));
   box.hidden = said === null;

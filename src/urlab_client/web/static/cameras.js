@@ -3,7 +3,7 @@
 // During a replay they show the recorded pictures; cameras that were not recorded stay live and are marked.
 
 import { now, paused } from "./bar.js";
-import { $, choices, duration, h, text } from "./dom.js";
+import { $, choices, duration, h, heading, text } from "./dom.js";
 import { clock, on, socketAt } from "./link.js";
 import { clockTime } from "./recording.js";
 
@@ -155,7 +155,7 @@ const camerasOf = (world) => [...world.cameras.map((camera) => [camera, ""]),
 
 export function makeCameras() {
   const grid = h("div", { class: "cameras" });
-  $("cameras").append(h("h2", {}, "Cameras"), grid);
+  $("cameras").append(heading("Cameras"), grid);
   on("world", ({ world }) => {
     const wanted = new Map(camerasOf(world).map(([camera, owner]) => [camera.path, [camera, owner]]));
     for (const [path, view] of views) {

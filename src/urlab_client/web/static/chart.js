@@ -6,6 +6,8 @@ export const COLORS = ["--c1", "--c2", "--c3", "--c4", "--c5", "--c6"];
 const DASHES = [[], [6, 3], [2, 2]]; // more signals than colours
 const PAD = { left: 46, right: 6, top: 6, bottom: 16 };
 const SHOWN_AT_FIRST = 6;
+const LEAST_S = 0.2;
+const GAP = 4; // times the mean distance
 
 /** Values over time; cleared when time goes back. */
 export class ChartData {
@@ -50,8 +52,8 @@ function ticks(low, high, count) {
 }
 
 export class Chart {
-  constructor(source, view, signature, { close, touchAll }) {
-    Object.assign(this, { source, view, signature, data: new ChartData(), stale: true, seen: false });
+  constructor(source, view, data, { close, touchAll }) {
+    Object.assign(this, { source, view, data, signature: source.signature, stale: true, seen: false });
     this.hidden = new Set(source.signals.slice(SHOWN_AT_FIRST).map((_, i) => i + SHOWN_AT_FIRST));
     this.canvas = h("canvas", { role: "img", "aria-label": `${source.title} over time${source.unit ? `, ${source.unit}` : ""}` });
     this.values = source.signals.map(() => h("span", { class: "num" }));
@@ -71,7 +73,7 @@ export class Chart {
     this.canvas.addEventListener("pointermove", (event) => {
       const width = this.canvas.clientWidth - PAD.left - PAD.right;
       const share = (event.offsetX - PAD.left) / width;
-      view.hover = share >= 0 && share <= 1 ? this.end - (1 - share) * view.span : null;
+      view.hover = share >= 0 && share <= 1 ? this.end - (1 - share) * this.span : null;
       touchAll();
     });
     this.canvas.addEventListener("pointerleave", () => { view.hover = null; touchAll(); });
@@ -79,6 +81,12 @@ export class Chart {
 
   get end() {
     return this.view.held ? this.view.end : this.data.times.at(-1) ?? 0;
+  }
+
+  /** Seconds across: fewer than chosen while there are fewer, so that a short replay fills its chart. */
+  get span() {
+    const there = this.end - (this.data.times[0] ?? 0);
+    return this.view.held ? this.view.span : Math.min(this.view.span, Math.max(there, LEAST_S));
   }
 
   touch() {
@@ -94,8 +102,8 @@ export class Chart {
       this.values.forEach((box) => text(box, ""));
       return;
     }
-    const { span, hover } = this.view;
-    const { end } = this;
+    const { hover } = this.view;
+    const { end, span } = this;
     const [from, to] = [Math.max(0, this.data.at(end - span) - 1), this.data.at(end + 1e-9)];
     const shown = this.source.signals.map((_, i) => i).filter((i) => !this.hidden.has(i));
     const pointed = hover === null ? Math.max(0, to - 1) : Math.min(times.length - 1, this.data.at(hover));
@@ -139,11 +147,16 @@ export class Chart {
     paint.beginPath(); paint.rect(PAD.left, 0, width - PAD.left - PAD.right, height); paint.clip();
     paint.lineWidth = 1.6;
     paint.lineJoin = "round";
+    // Where states did not come, there is no curve.
+    const gap = this.view.recorded ? Infinity : Math.max(LEAST_S, (GAP * (times[to - 1] - times[from])) / Math.max(1, to - 1 - from));
     for (const i of shown) {
       paint.strokeStyle = colors.lines[i % colors.lines.length];
       paint.setLineDash(DASHES[Math.floor(i / COLORS.length) % DASHES.length]);
       paint.beginPath();
-      for (let k = from; k < to; k++) paint.lineTo(x(times[k]), y(values[k][i]));
+      for (let k = from; k < to; k++) {
+        if (k > from && times[k] - times[k - 1] > gap) paint.moveTo(x(times[k]), y(values[k][i]));
+        else paint.lineTo(x(times[k]), y(values[k][i]));
+      }
       paint.stroke();
     }
     paint.setLineDash([]);
@@ -151,6 +164,10 @@ export class Chart {
       paint.strokeStyle = colors.ink;
       paint.lineWidth = 1;
       paint.beginPath(); paint.moveTo(x(times[pointed]), PAD.top); paint.lineTo(x(times[pointed]), height - PAD.bottom); paint.stroke();
+      paint.fillStyle = colors.ink;
+      const left = x(times[pointed]) > width / 2;
+      paint.textAlign = left ? "right" : "left";
+      paint.fillText(`${times[pointed].toFixed(3)} s`, x(times[pointed]) + (left ? -4 : 4), PAD.top + 5);
     }
     paint.restore();
   }

@@ -75,6 +75,21 @@ export function confirmed(attributes, label, question, act) {
   return button;
 }
 
+/** Make a panel's heading, whose title folds what stands below it; the browser remembers that. */
+export function heading(title, ...rest) {
+  const kept = `urlab-folded/${title}`;
+  const button = h("button", { class: "fold", title: "Fold or unfold this panel", onclick: () => fold(!top.classList.contains("folded")) }, title);
+  const top = h("h2", {}, button, ...rest);
+  function fold(folded) {
+    top.classList.toggle("folded", folded);
+    button.setAttribute("aria-expanded", !folded);
+    if (folded) localStorage.setItem(kept, "yes");
+    else localStorage.removeItem(kept);
+  }
+  fold(localStorage.getItem(kept) !== null);
+  return top;
+}
+
 /** Tell a screen reader what changed. */
 export const announce = (message) => text($("announcements"), message);
 

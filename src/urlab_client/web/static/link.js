@@ -7,6 +7,7 @@ const listeners = new Map();
 
 export const me = { viewer: "", name: "" };
 export const clock = { offset: 0, best: Infinity };
+const NAME = "urlab-name";
 const PING_MS = 2000;
 const SILENT_MS = 6000;
 let socket = null;
@@ -46,7 +47,9 @@ export function connect() {
       requestAnimationFrame(() => send({ type: "ack" }));
     } else if (message.type === "you") {
       me.viewer = message.viewer;
-      me.name = message.name;
+      me.name = sessionStorage.getItem(NAME) ?? message.name; // the same after the page is loaded again
+      sessionStorage.setItem(NAME, me.name);
+      if (me.name !== message.name) send({ type: "name", name: me.name });
     } else if (message.type === "pong") {
       const now = Date.now();
       const trip = now - message.at;

@@ -1,6 +1,6 @@
 // Recordings: start and stop, and the files: download in several formats, replay, upload, deletion.
 
-import { $, confirmed, h, number, text, toast } from "./dom.js";
+import { $, confirmed, h, heading, number, text, toast } from "./dom.js";
 import { ask, on, upload } from "./link.js";
 
 const record = h("button", { id: "record", onclick: toggle }, "● Record");
@@ -34,7 +34,8 @@ async function toggle() {
   record.disabled = true;
   if (running) {
     const made = await ask("DELETE", "api/recording");
-    if (made) toast(`${made.name}: ${clockTime(made.seconds)}, ${bytes(made.bytes)}.`, "good");
+    if (made?.seconds) toast(`${made.name}: ${clockTime(made.seconds)}, ${bytes(made.bytes)}.`, "good");
+    else if (made) toast(`${made.name} is empty: no state came while it recorded. If physics stands still, press Play first.`);
     refresh();
   } else await ask("POST", "api/recording", { cameras: cameras.checked });
   record.disabled = false;
@@ -45,7 +46,7 @@ async function open() {
   if (!chosen) return;
   opener.disabled = true;
   const made = await upload(at(chosen.name), chosen, (share) => text(opener, `Opening … ${Math.floor(share * 100)} %`));
-  if (made) toast(`${chosen.name} was added.`, "good");
+  if (made) toast(`${chosen.name} was added.${made.damage && ` It is incomplete: ${made.damage}.`}`, "good");
   file.value = "";
   opener.disabled = false;
   text(opener, OPEN);
@@ -66,6 +67,7 @@ function row(recording) {
     kinds.append(link(`${own}, as recorded`, ""), link("CSV, states as a table", "?as=csv"), link("NPZ, NumPy arrays", "?as=npz"));
     const about = await ask("GET", `${at(name)}?as=about`);
     const missing = about?.unavailable.mp4;
+    if (about?.damage) kinds.append(h("p", { class: "hint" }, `Incomplete: ${about.damage}.`));
     for (const camera of missing ? [] : about?.cameras ?? []) {
       kinds.append(link(`MP4, ${camera}`, `?as=mp4&camera=${encodeURIComponent(camera)}`));
     }
@@ -101,7 +103,7 @@ async function refresh() {
 }
 
 export function makeRecording() {
-  $("recording").append(h("h2", {}, "Recordings"),
+  $("recording").append(heading("Recordings"),
     h("div", { class: "line" }, record, h("label", { class: "check" }, cameras, " with cameras"), progress,
       h("span", { class: "space" }), opener, file),
     list);
@@ -117,6 +119,6 @@ export function makeRecording() {
       text(one.querySelector("summary"), making ? `Preparing ${making.kind.toUpperCase()} … ${Math.floor(making.share * 100)} %` : DOWNLOAD);
     }
     progress.classList.toggle("old", running && status.recording.failed);
-    text(progress, !running ? "" : status.recording.failed ? "cannot be written" : `${number(status.recording.seconds, 1).trim()} s · ${bytes(status.recording.bytes)}`);
+    text(progress, !running ? "" : status.recording.failed ? "cannot be written" : !status.recording.states ? "waiting for physics" : `${number(status.recording.seconds, 1).trim()} s · ${bytes(status.recording.bytes)}`);
   });
 }

@@ -8,6 +8,7 @@ const PACES = [0.1, 0.25, 0.5, 1, 2, 4];
 const line = h("input", { id: "timeline", type: "range", min: 0, max: 1, step: "any", value: 0, oninput: () => seek(+line.value),
   onkeydown: keys, "aria-label": "Position in the recording, seconds", title: "← → by 0.1 s, with Shift by 10 s" });
 const name = h("b", { class: "name" });
+const damage = h("span", { class: "tag", id: "damage" }, "incomplete");
 const where = h("span", { class: "num", id: "replay-time" });
 const play = h("button", { id: "replay-play", onclick: toggleReplay }, "▶");
 const pace = h("select", { "aria-label": "Pace of the replay", onchange: () => ask("POST", "api/replay", { rate: +pace.value }) },
@@ -55,7 +56,7 @@ function keys(event) {
 }
 
 export function makeReplay() {
-  $("replay").append(h("span", { class: "tag" }, "Replay"), name, play, line, where, pace, placing, end);
+  $("replay").append(h("span", { class: "tag" }, "Replay"), name, damage, play, line, where, pace, placing, end);
   // Stick below the bar if that is sticky, so that both stay visible while the user scrolls.
   new ResizeObserver(() => {
     $("replay").style.top = getComputedStyle($("bar")).position === "sticky" ? `${$("bar").offsetHeight}px` : "0";
@@ -70,6 +71,8 @@ export function makeReplay() {
     for (const part of ["#robots", "#teleop", ".more"]) document.querySelector(part).inert = useless;
     if (!replay) return;
     text(name, replay.name.replace(/\.mcap$/, ""));
+    damage.hidden = !replay.damage;
+    damage.title = replay.damage;
     text(play, replay.playing ? "❚❚" : "▶");
     play.setAttribute("aria-label", replay.playing ? "Pause the replay" : "Play the replay");
     placing.setAttribute("aria-pressed", replay.placing);
@@ -78,5 +81,6 @@ export function makeReplay() {
     const held = seeking || line.matches(":active");
     if (!held) line.value = replay.time;
     text(where, `${clockTime(held ? +line.value : replay.time)} of ${clockTime(replay.seconds)}`);
+    line.setAttribute("aria-valuetext", where.textContent);
   });
 }

@@ -1,8 +1,8 @@
 // Articulations: joint positions against their ranges, actuator sliders, gains, commanded twist.
 
-import { ActuatorRow, actuatorTable, canHold, groups, limp, share, stillness } from "./actuators.js";
-import { now } from "./bar.js";
-import { $, h, number, text } from "./dom.js";
+import { ActuatorRow, actuatorTable, canHold, fallen, groups, limp, share, stillness } from "./actuators.js";
+import { now, reset } from "./bar.js";
+import { $, h, heading, number, text } from "./dom.js";
 import { ask, on, op } from "./link.js";
 
 let robots = [];
@@ -18,20 +18,27 @@ class Robot {
     const driven = new Set(art.actuators.map((actuator) => actuator.joint));
     this.said = h("span", {});
     this.hold = h("button", { "aria-pressed": "false", title: "Keep the joints at the home pose; this needs mode direct, and chooses it",
-      onclick: () => hold(art.key, this.hold.getAttribute("aria-pressed") !== "true") }, "Hold pose");
+      onclick: () => this.toggle() }, "Hold pose");
     // Once shown, it keeps its place: what is below must not move from under a finger.
-    this.still = h("div", { class: "line still", hidden: !canHold(art) }, this.said, h("span", { class: "space" }), canHold(art) ? this.hold : null);
+    this.still = h("div", { class: "line still over", hidden: !canHold(art) }, this.said, h("span", { class: "space" }), canHold(art) ? this.hold : null);
     const why = h("button", { class: "quiet why", title: "Check everything from the sockets to the set-points", onclick: () => explain(art.key) }, "Why does it not move?");
-    const tables = groups(art).map((group) => actuatorTable(group, group.actuators.map((actuator) => this.actuator(actuator, art))));
+    this.tables = groups(art).map((group) => actuatorTable(group, group.actuators.map((actuator) => this.actuator(actuator, art))));
     this.element = h("section", { class: "card robot", "data-robot": art.key, "aria-label": art.key },
-      h("h2", {}, art.key, h("span", { class: "tag" }, `${count(art.joints.length, "joint")} · ${count(art.actuators.length, "actuator")}`),
+      heading(art.key, h("span", { class: "tag" }, `${count(art.joints.length, "joint")} · ${count(art.actuators.length, "actuator")}`),
         h("span", { class: "space" }), why),
-      this.still, ...tables,
+      this.still, ...this.tables,
       fold("Joints", joints.some((joint) => !driven.has(joint.name)) && !art.actuators.length,
         h("div", { class: "table joints" }, joints.map((joint) => this.joint(joint)))),
       art.controller && GAINS.some((gain) => gain in art.controller.params) ? fold("Gains", false, this.gains(art)) : null,
       art.joints.some((joint) => joint.kind === "free") ? fold("Commanded twist", false, this.twist()) : null);
     this.art = art;
+  }
+
+  /** Hold the home pose, or let go. A robot that has fallen is held before it is put back, or it would fall again. */
+  async toggle() {
+    const holding = this.hold.getAttribute("aria-pressed") === "true";
+    const lies = !holding && fallen(this.art, now.state?.articulations[this.key]);
+    if ((await hold(this.key, !holding)) !== null && lies) await reset();
   }
 
   actuator(actuator, art) {
@@ -121,11 +128,14 @@ class Robot {
 
   draw(state) {
     for (const row of this.rows) row(state);
+    for (const table of this.tables) table.inert = now.status?.mode === "puppet"; // where set-points do nothing
     const said = stillness(this.art, state, now.status);
     if (said) this.still.hidden = false;
     this.still.classList.toggle("over", !said);
     text(this.said, said);
-    this.hold.setAttribute("aria-pressed", now.status?.holding.includes(this.key) ?? false);
+    const holding = now.status?.holding.includes(this.key) ?? false;
+    this.hold.setAttribute("aria-pressed", holding);
+    text(this.hold, !holding && fallen(this.art, state) ? "Reset and hold" : "Hold pose");
   }
 }
 
@@ -137,14 +147,29 @@ export const steady = () => Promise.all(robots.filter((robot) => now.status.sour
 
 const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 
+/** What a program calls, as what a viewer presses. */
+const PRESS = [
+  [/Call runtime\.set_paused\(False\).*?--unpaused\./, "Press Play."],
+  [/Call runtime\.set_control_source\('zmq'\)\./, "Choose control “zmq” under More."],
+  [/Set them with set_ctrl\(\) or ctrl_array before step\(\)\./, "Move a slider."],
+  [/step\(\) has not been called since discover\(\)\. Nothing moves without it\./, "No step has been taken. Press Play."],
+  [/Call sim\.start\(\)\./, "Press Begin play."],
+  [/Raise it with set_gains\(\)\./, "Raise it under “Gains”."],
+];
+
 /** Show the client's diagnosis of a robot that does not move. */
 async function explain(key) {
   const answer = await ask("GET", "api/explain");
   if (!answer) return;
-  const findings = answer.findings.filter((one) => one.verdict !== "ok" && (one.subject === key || !document.querySelector(`[data-robot="${one.subject}"]`)));
+  const robot = robots.find((one) => one.key === key);
+  const said = robot && now.state ? stillness(robot.art, now.state.articulations[key], now.status) : "";
+  const beside = now.status?.mode === "puppet" ? ["steps", key] : []; // where no step and no set-point is wanted
+  const findings = answer.findings.filter((one) => !beside.includes(one.subject) && one.verdict !== "ok" && (one.subject === key || !document.querySelector(`[data-robot="${one.subject}"]`)));
   $("findings").replaceChildren(h("h2", {}, `Why does ${key} not move?`),
-    h("ul", {}, findings.length ? findings.map((one) => h("li", { class: one.verdict }, h("b", {}, one.subject), ` ${one.text}`))
-      : h("li", {}, "Nothing was found that keeps it from moving.")),
+    ...[said, now.status?.mode === "direct" && !now.status.running ? "Nothing steps it now. Press Play." : ""].filter(Boolean).map((one) => h("p", {}, one)),
+    h("ul", {}, findings.map((one) => h("li", { class: one.verdict }, h("b", {}, one.subject),
+      ` ${PRESS.reduce((said, [call, press]) => said.replace(call, press), one.text)}`)),
+      findings.length || said ? null : h("li", {}, "Nothing was found that keeps it from moving.")),
     h("form", { method: "dialog" }, h("button", {}, "Close")));
   $("findings").showModal();
 }

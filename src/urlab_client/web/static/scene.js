@@ -1,6 +1,6 @@
 // The level: its actors, spawning, moving and removing them; and contacts.
 
-import { $, choices, confirmed, h, number, text, toast } from "./dom.js";
+import { $, choices, confirmed, h, heading, number, text, toast } from "./dom.js";
 import { ask, on, op } from "./link.js";
 import { fold } from "./robots.js";
 
@@ -15,6 +15,7 @@ const importing = h("button", { class: "quiet", title: "An MJCF file, or a ZIP a
 const warning = h("div", { class: "line warning", id: "no-manager", hidden: true },
   h("span", {}, "Play cannot begin: this level has no manager."),
   h("button", { id: "add-manager", onclick: async () => done(await op("ensure_manager")) }, "Add manager"));
+const due = h("div", { class: "line warning", id: "edits-due", hidden: true }, "The level has changed since play began. “Restart play” shows it.");
 const replacing = h("div", { class: "line warning", id: "would-replace", role: "alert", hidden: true });
 /** Actors that the plugin itself needs; users do not place or remove them. */
 const isManager = (actor) => /^A?Mj(Replay)?Manager$/.test(actor.class);
@@ -25,6 +26,14 @@ function xyz(values, whose) {
 }
 
 const rows = new Map();
+const EDITS = ["spawn_actor", "duplicate_actor", "destroy_actor", "set_actor_transform"];
+let edited = false; // since play began
+let playing = false;
+
+function markEdits() {
+  due.hidden = !(edited && playing);
+  $("restart").classList.toggle("due", !due.hidden);
+}
 const read = (inputs) => inputs.map((input) => +input.value || 0);
 
 function done(answer) {
@@ -70,11 +79,15 @@ class Row {
         h("span", { class: "tag" }, actor.is_light ? "light" : actor.is_articulation ? "robot" : "mesh")),
       h("span", { class: "acts" },
         h("button", { class: "quiet", title: "Move to this position and yaw", "aria-label": `Move ${name}`,
-          onclick: async () => done(await op("set_actor_transform", { ...target, location: read(this.where), rotation_quat: quaternion(this.yaw) })) }, "move"),
+          onclick: () => this.move(target) }, "move"),
         actor.is_articulation ? h("button", { class: "quiet", title: "Spawn another one beside it", "aria-label": `Duplicate ${name}`,
           onclick: async () => done(await op("duplicate_actor", { ...target, new_actor_id: unused(name), location: free(read(this.where)) })) }, "duplicate") : null,
         confirmed({ class: "quiet", title: "Remove from the level", "aria-label": `Remove ${name}` }, "remove", "Remove?", async () => done(await op("destroy_actor", target)))),
-      fields(this.where, this.yaw));
+      fields(this.where, this.yaw, () => this.move(target)));
+  }
+
+  async move(target) {
+    done(await op("set_actor_transform", { ...target, location: read(this.where), rotation_quat: quaternion(this.yaw) }));
   }
 
   update(actor) {
@@ -86,8 +99,8 @@ class Row {
   }
 }
 
-/** Position and yaw, each with its label. */
-const fields = (where, yaw) => h("span", { class: "fields" },
+/** Position and yaw, each with its label; Enter does what the button beside them does. */
+const fields = (where, yaw, enter) => h("span", { class: "fields", onkeydown: (event) => event.key === "Enter" && enter() },
   where.map((input, i) => h("label", {}, `${"xyz"[i]} `, input)), h("span", { class: "hint" }, "m"),
   h("label", {}, "yaw ", yaw), h("span", { class: "hint" }, "°"));
 
@@ -159,12 +172,21 @@ function confirmReplacing(chosen, { message, name }) {
 export function makeScene() {
   for (const input of place) input.addEventListener("input", () => { input.dataset.typed = "yes"; });
   blueprint.addEventListener("change", propose);
-  $("scene").append(h("h2", {}, "Scene", h("span", { class: "space" }), importing, file), warning, replacing, actors,
+  $("scene").append(heading("Scene", h("span", { class: "space" }), importing, file), warning, due, replacing, actors,
     h("div", { class: "spawn" }, h("h3", {}, "Add to the level"),
       h("span", { class: "fields" }, h("label", {}, "blueprint ", blueprint), h("label", {}, "name ", id)),
-      fields(place, yaw), h("button", { id: "spawn", onclick: spawn }, "Spawn")));
+      fields(place, yaw, spawn), h("button", { id: "spawn", onclick: spawn }, "Spawn")));
   on("world", refresh);
+  on("status", (status) => {
+    playing = status.playing;
+    markEdits();
+  });
   on("log", ({ entries }) => {
+    for (const { kind, what } of entries) {
+      if (["play_started", "session_opened"].includes(what)) edited = false;
+      else if (kind === "call" && EDITS.includes(what)) edited = true;
+    }
+    markEdits();
     if (entries.some((entry) => /^(spawn|destroy|set_actor|duplicate|ensure_manager|load_level|create_level|import)/.test(entry.what))) refresh();
   });
 }

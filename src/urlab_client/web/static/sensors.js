@@ -1,7 +1,7 @@
 // Curves over the last seconds of simulation time: sensors, and each robot's joints and actuators.
 
 import { Chart, ChartData, COLORS } from "./chart.js";
-import { $, h } from "./dom.js";
+import { $, h, heading } from "./dom.js";
 import { ask, on } from "./link.js";
 
 const SPANS = [2, 8, 30, 120];
@@ -14,35 +14,63 @@ const span = h("select", { id: "span", "aria-label": "Seconds of the curves", on
   SPANS.map((seconds) => h("option", { value: seconds, selected: seconds === 8 }, `${seconds} s`)));
 const pause = h("button", { id: "pause-curves", "aria-pressed": "false", onclick: () => hold(!view.held) }, "❚❚ Hold");
 const back = h("input", { type: "range", id: "scroll-back", min: 0, max: KEPT_S, step: "any", value: KEPT_S, "aria-label": "Scroll back", hidden: true,
-  oninput: () => { view.end = view.last - (KEPT_S - back.value) * Math.min(1, (view.last - view.first) / KEPT_S); charts.forEach((chart) => chart.touch()); } });
+  oninput: () => { view.end = view.last - (1 - back.value / KEPT_S) * Math.max(0, view.last - view.first - view.span); charts.forEach((chart) => chart.touch()); } });
 const probe = h("i", { hidden: true });
 
-/** Shared by all curves: the end of the time span (the newest state unless held), and the pointer's position. */
-const view = { held: false, end: 0, last: 0, first: 0, hover: null, get span() { return +span.value; } };
+/**
+ * Shared by all curves: the end of the time span (the newest state unless held), and the pointer's position. Curves that
+ * are held stay as they are when the simulation is reset: what comes afterwards is kept apart.
+ */
+const view = { held: false, apart: false, end: 0, last: 0, first: 0, hover: null, get span() { return +span.value; } };
+/** What came, by curve: of the simulation, and of a recording. */
+const kept = { live: new Map(), recorded: new Map() };
+let all = []; // the sources of all curves, shown or not
 let charts = [];
 let replay = null;
 let came = 0;
+let newest = 0; // of the simulation's times
 let filling = false;
 let again = false;
 
+const store = () => (replay ? kept.recorded : kept.live);
+
+function dataOf(curves, signature) {
+  if (!curves.has(signature)) curves.set(signature, new ChartData());
+  return curves.get(signature);
+}
+
+/** Keep a state's values, of curves that are not shown for as long as the others span, so that one added is not empty. */
 function take(state) {
+  if (!state.recorded && state.time < newest) {
+    kept.live = new Map();
+    view.apart = view.held;
+    if (!replay && !view.apart) connect();
+  }
+  if (!state.recorded) newest = state.time;
+  const curves = state.recorded ? kept.recorded : kept.live;
+  const shown = new Set(charts.map((chart) => chart.signature));
+  for (const source of all) {
+    const own = state.articulations[source.art];
+    const values = own && source.read(own);
+    if (values) dataOf(curves, source.signature).add(state.time, values, shown.has(source.signature) ? KEPT_S : view.span);
+  }
+  if (curves !== store() || view.apart) return;
   if (state.time < view.last) view.first = state.time;
   view.last = state.time;
   view.first = Math.max(view.first, view.last - KEPT_S);
-  for (const chart of charts) {
-    const own = state.articulations[chart.source.art];
-    const values = own && chart.source.read(own);
-    if (values) chart.data.add(state.time, values, KEPT_S);
-  }
   if (!view.held) charts.forEach((chart) => chart.touch());
 }
 
-function clear() {
+/** Show what is kept. */
+function connect() {
+  const times = [...store().values()].map((data) => data.times).filter((times) => times.length);
+  view.apart = false;
+  view.last = Math.max(0, ...times.map((times) => times.at(-1)));
+  view.first = Math.min(view.last, ...times.map((times) => times[0]));
   for (const chart of charts) {
-    chart.data = new ChartData();
+    chart.data = dataOf(store(), chart.signature);
     chart.touch();
   }
-  view.first = view.last = 0;
 }
 
 /** Fill the curves with the states before the replay's position. */
@@ -54,8 +82,9 @@ async function fill() {
     again = false;
     const past = await ask("GET", `api/replay/states?seconds=${view.span}`, undefined, { quiet: true });
     if (!past || !replay) break;
-    clear();
+    kept.recorded.clear();
     past.states.forEach(take);
+    connect();
   }
   filling = false;
 }
@@ -68,6 +97,7 @@ function jumped(time) {
 }
 
 function hold(held) {
+  if (view.apart) connect();
   Object.assign(view, { held, end: view.last });
   pause.setAttribute("aria-pressed", held);
   pause.textContent = held ? "▶ Follow" : "❚❚ Hold";
@@ -107,14 +137,13 @@ function sources(art) {
     found.push({ key: `${art.key}/ctrl`, title: forces ? "forces applied" : "controls applied", kind: "actuators", unit: forces ? "N m, N" : "",
       signals: art.actuators.map((actuator) => actuator.name), read: (state) => state.ctrl && art.actuators.map((actuator) => state.ctrl[actuator.index]) });
   }
-  return found.map((source) => ({ ...source, art: art.key }));
+  return found.map((source) => ({ ...source, art: art.key, signature: JSON.stringify([source.key, source.signals, source.unit]) }));
 }
 
 export function makeSensors() {
   const grid = h("div", { class: "curves" });
   const add = h("select", { id: "add-curve", "aria-label": "Add a curve" });
-  $("sensors").append(h("h2", {}, "Curves", h("span", { class: "space" }), add, span, pause), back, grid, probe);
-  let all = [];
+  $("sensors").append(heading("Curves", h("span", { class: "space" }), add, span, pause), back, grid, probe);
   const chosen = new Map(JSON.parse(localStorage.getItem("urlab-curves") ?? "[]")); // key: whether it is shown
 
   function choose(key, wanted) {
@@ -127,8 +156,8 @@ export function makeSensors() {
     const old = new Map(charts.map((chart) => [chart.signature, chart]));
     const robots = new Set(all.map((source) => source.art));
     charts = all.filter((source) => chosen.get(source.key) ?? source.shown).map((source) => {
-      const signature = JSON.stringify([source.key, source.signals, source.unit]);
-      const chart = old.get(signature) ?? new Chart(source, view, signature, { close: () => choose(source.key, false), touchAll: () => charts.forEach((one) => one.touch()) });
+      const { signature } = source;
+      const chart = old.get(signature) ?? new Chart(source, view, dataOf(store(), signature), { close: () => choose(source.key, false), touchAll: () => charts.forEach((one) => one.touch()) });
       chart.source = source;
       return chart;
     });
@@ -146,19 +175,27 @@ export function makeSensors() {
   add.addEventListener("change", () => add.value && choose(add.value, true));
   on("world", ({ world }) => {
     all = world.articulations.flatMap(sources);
+    const known = new Set(all.map((source) => source.signature));
+    for (const curves of Object.values(kept)) for (const signature of [...curves.keys()]) if (!known.has(signature)) curves.delete(signature);
     arrange();
   });
   on("state", (state) => {
-    if (state.time < view.last && view.held) hold(false);
-    if (jumped(state.time) && replay) fill();
+    if (state.recorded === (replay !== null)) {
+      if (replay && state.time < view.last && view.held) hold(false);
+      if (jumped(state.time) && replay) fill();
+    }
     take(state);
   });
   on("status", (status) => {
     const other = status.replay?.name !== replay?.name;
+    const halted = replay?.playing && !status.replay?.playing; // while it played, not every state came
     replay = status.replay;
-    if (!other) return;
-    clear();
-    if (replay) fill();
+    view.recorded = replay !== null; // of which a page that is slow skips states, and none is missing
+    if (other) {
+      kept.recorded.clear();
+      connect();
+    }
+    if (replay && (other || halted)) fill();
   });
   const paint = () => {
     requestAnimationFrame(paint);

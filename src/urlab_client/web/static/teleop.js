@@ -1,7 +1,7 @@
 // Moves a hand with keys or a gamepad: sends velocities to the console, which solves for the joints.
 
 import { now, reset } from "./bar.js";
-import { $, choices, h, text } from "./dom.js";
+import { $, choices, h, heading, text } from "./dom.js";
 import { ask, on, send } from "./link.js";
 
 const PERIOD_MS = 20;
@@ -124,11 +124,11 @@ export function makeTeleop() {
   ui.site = h("input", { id: "hand-site", placeholder: "its only site", "aria-label": "Site of the hand", size: 12 });
   ui.pad = h("p", { class: "hint", id: "gamepad" });
   const outcomes = [["success", "Success"], ["failure", "Failure"], ["discarded", "Discard"]].map(([outcome, label]) =>
-    h("button", { class: "quiet", "data-outcome": outcome, disabled: true, onclick: () => judge(outcome) }, label));
-  $("teleop").append(h("h2", {}, "Hand"),
+    h("button", { class: "quiet", "data-outcome": outcome, title: `${label}, and reset`, disabled: true, onclick: () => judge(outcome) }, label));
+  $("teleop").append(heading("Hand"),
     h("div", { class: "line" }, ui.drive, ui.robot, h("label", {}, "site ", ui.site)),
     ui.pad,
-    h("div", { class: "line" }, h("span", { class: "hint" }, "Mark the recorded episode:"), ...outcomes),
+    h("div", { class: "line" }, h("span", { class: "hint" }, "Mark the recorded episode, and reset:"), ...outcomes),
     h("details", {}, h("summary", {}, "Keys and buttons"),
       h("table", { class: "mapping" }, h("tr", {}, ...["keys", "gamepad", "world frame: x forward, y left, z up"].map((head) => h("th", {}, head))),
         ...MAPPING.map((row) => h("tr", {}, ...row.map((cell) => h("td", {}, cell)))))));

@@ -20,8 +20,8 @@ const WITH_FINGERS = {
 
 /** The reason why this browser cannot show the view, or an empty string. */
 function lacking() {
-  if (!window.crossOriginIsolated) return "Browsers show the 3-D view only on this machine or over HTTPS. A camera shows the scene instead.";
-  if (!document.createElement("canvas").getContext("webgl2")) return "This browser has no WebGL 2, which the 3-D view needs. A camera shows the scene instead.";
+  if (!window.crossOriginIsolated) return "Browsers show the 3‑D view only on this machine or over HTTPS. A camera shows the scene instead.";
+  if (!document.createElement("canvas").getContext("webgl2")) return "This browser has no WebGL 2, which the 3‑D view needs. A camera shows the scene instead.";
   return "";
 }
 

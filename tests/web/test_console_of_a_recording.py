@@ -1,0 +1,73 @@
+"""`urlab console FILE`: a console without a simulation, which shows recordings."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator
+from pathlib import Path
+
+import pytest
+from waiting import until
+
+import urlab_client
+from urlab_client.aio import URLabClient
+from urlab_client.console.replay import recorded_handshake
+from urlab_client.console.session import ConsoleSession
+from urlab_client.integrations.record import read_run, record
+from urlab_client.server import SimulatedServer
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings of an arm and of a ball, each of half a second."""
+    folder = tmp_path_factory.mktemp("recordings")
+    for model in ("arm", "ball"):
+        with (
+            SimulatedServer(model, play=True) as server,
+            urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+        ):
+            client.discover()
+            with record(client, folder / f"{model}.mcap"):
+                for _ in range(26):
+                    client.step(n_steps=10)
+    return folder
+
+
+@contextlib.asynccontextmanager
+async def console_of(file: Path) -> AsyncGenerator[ConsoleSession]:
+    handshake = await asyncio.to_thread(lambda: recorded_handshake(read_run(file)))
+    async with (
+        SimulatedServer() as bare,
+        URLabClient(**bare.client_options(), read_only=True, live_pictures=False) as client,
+    ):
+        console = ConsoleSession(client, recordings=file.parent, handshake=lambda: handshake, replayed=file)
+        async with console.open():
+            await until(lambda: console.replay.view is not None and not console.replay.view.playing)
+            yield console
+
+
+async def test_it_plays_from_the_start_once_somebody_watches(folder: Path) -> None:
+    async with console_of(folder / "arm.mcap") as console:
+        assert console.replay.at == 0.0
+        with console.new_viewer():
+            await until(lambda: console.replay.view is not None and console.replay.at == console.replay.view.seconds)
+
+
+async def test_where_a_program_has_moved_it_to_it_stays(folder: Path) -> None:
+    async with console_of(folder / "arm.mcap") as console:
+        await console.replay.change(at=0.3)
+        with console.new_viewer() as viewer:
+            assert console.status(viewer).viewers == 1
+            await until(lambda: len(console.view._watchers) == 0)  # nothing waits for viewers any more
+        assert (console.replay.at, console.replay.rate) == (0.3, 0.0)
+
+
+async def test_it_opens_recordings_of_other_robots_too(folder: Path) -> None:
+    async with console_of(folder / "arm.mcap") as console:
+        await console.begin_replay(folder / "ball.mcap")
+        assert [robot.key for robot in console.view.world.articulations] == ["ball"]
+        await until(lambda: console.view.snapshot is not None and "ball" in console.view.snapshot.per_articulation)
+        await console.begin_replay(folder / "arm.mcap")
+        await until(lambda: console.view.snapshot is not None and "arm" in console.view.snapshot.per_articulation)
+        assert [robot.key for robot in console.view.world.articulations] == ["arm"]
