@@ -122,6 +122,7 @@ def test_the_file_holds_to_the_bit_what_the_client_saw(client: urlab_client.URLa
             watch(client, seen)
     assert (recorder.stats.states, recorder.stats.dropped_states) == (120, 0)
     run = read_run(recorder.path)
+    assert recorder.stats.duration_s == pytest.approx(run.table().time[-1] - run.table().time[0], abs=1e-9)
     assert_equal_to(run, seen)
     table = run.table()
     assert table.episode.tolist() == [0] * 60 + [1] * 60
@@ -468,6 +469,10 @@ def test_a_cut_file_is_read_up_to_the_cut(client: urlab_client.URLabClient, tmp_
         assert run.summary().topics.keys() <= {"/state/arm", "/state/quadruped"}
     assert steps == sorted(steps)
     assert steps[-1] == 50
+    assert read_run(cut).model().nq == client.model.nq, "of a recorder that was killed"
+    cut.write_bytes(whole[: whole.index(b"model.mjb")])
+    with pytest.raises(RecordingError, match="the model in it cannot be read"):
+        read_run(cut).model()
     for size in (0, 7):
         cut.write_bytes(whole[:size])
         with pytest.raises(RecordingError, match="neither an MCAP file"):

@@ -373,6 +373,7 @@ def test_info_tells_what_is_there(recorded: Run, tmp_path: Path, capsys: pytest.
     shown = capsys.readouterr().out
     for part in ("2 episodes", "/state/arm", "foxglove.CompressedImage", "250.0", "direct mode"):
         assert part in shown
+    assert "\npositions of arm: shoulder_pan, shoulder_lift," in shown
     assert run("info", recorded.path, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["topics"]["/state/arm"]["messages"] == 100
@@ -399,6 +400,9 @@ def test_convert_writes_whole_files_and_overwrites_only_when_told(
     assert run("convert", recorded.path, target, "--overwrite") == 0
     assert target.stat().st_size > 500
     assert os.listdir(tmp_path) == [target.name]
+    said = capsys.readouterr().out
+    assert said.startswith(f"{target}  ")
+    assert said.endswith(" rows: states, with the actions that followed\n") == (kind in {"csv", "parquet"})
 
 
 @pytest.mark.parametrize(
@@ -424,7 +428,9 @@ def test_plot_draws_the_joints_that_are_named(
     recorded: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("plot", recorded.path, "--joints", "arm/shoulder*", "spin", "-o", tmp_path / "a.png") == 0
-    assert "3 curves, 100 states" in capsys.readouterr().out
+    assert "3 curves, 100 states\n" in capsys.readouterr().out
+    assert run("plot", recorded.path, "-o", tmp_path / "a.png") == 0
+    assert capsys.readouterr().out.endswith(" 100 states, instead of the file that was there\n")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     assert run("plot", recorded.path, "--joints", "nose", "-o", tmp_path / "b.png") == 2
     assert "arm/shoulder_pan" in capsys.readouterr().err

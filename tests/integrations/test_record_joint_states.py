@@ -64,7 +64,7 @@ def test_the_commands_read_it(saved: Path, tmp_path: Path, capsys: pytest.Captur
     assert len(rows) == len(json.loads(saved.read_bytes())["Frames"])
     assert any(name.startswith("joints/qpos/") for name in rows[0])
     assert main(["convert", str(saved), str(tmp_path / "falls.mp4")]) == 2
-    assert "there are none" in capsys.readouterr().err
+    assert "has no pictures" in capsys.readouterr().err
 
 
 def test_a_file_that_only_begins_like_one_is_refused(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -69,6 +69,7 @@ class Summary:
         topics: Topics by name.
         varied: The server's randomisation, by episode.
         outcomes: Outcomes of the marked episodes.
+        positions: Quantity and unit of each value of `qpos` by its name, by articulation.
     """
 
     path: Path
@@ -83,6 +84,7 @@ class Summary:
     topics: dict[str, Topic]
     varied: tuple[EpisodeMessage, ...] = ()
     outcomes: tuple[OutcomeMessage, ...] = ()
+    positions: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +135,12 @@ class Table:
         return f"<Table states: {len(self)}{passed}, columns: {len(self.columns)}>"
 
     def _repr_html_(self) -> str:
-        rows = [(key, column.values.shape[1], ", ".join(column.labels)) for key, column in self.columns.items()]
-        return table(rows, heads=("column", "values", "names"), caption=repr(self)[1:-1])
+        ends = [0, -1] if len(self) else []
+        rows = [
+            (key, column.values.shape[1], ", ".join(column.labels), *column.values[ends])
+            for key, column in self.columns.items()
+        ]
+        return table(rows, heads=("column", "values", "names", "first", "last"), caption=repr(self)[1:-1])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all arrays by name: `time`, …, then `ARTICULATION/FIELD`, shape (n, values)."""

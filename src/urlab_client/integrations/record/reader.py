@@ -14,12 +14,14 @@ import zlib
 from array import array
 from collections.abc import Collection, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar, cast
+from typing import TYPE_CHECKING, BinaryIO, Final, TypeVar, cast
 
 import msgspec
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.records import Attachment
+from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from urlab_client.errors import URLabError
@@ -47,7 +49,7 @@ from urlab_client.integrations.record.contents import (
     describe_topic,
 )
 from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Progress, RecordedMessage, RecordingIndex
-from urlab_client.integrations.record.tables import SampleTimes, Source, TableBuilder
+from urlab_client.integrations.record.tables import SampleTimes, Source, TableBuilder, quantities
 from urlab_client.integrations.record.writer import GOAL, MODEL_NAME, TASK, RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.values.html import curve, fields, number, table
@@ -120,6 +122,7 @@ class Run:
         ends = [time for stamps in stamps_of.values() for time in (stamps[0], stamps[-1])]
         ends_of = [(index.first(one), index.newest(one)) for one in index.channels]
         walls = [end.publish_time for pair in ends_of for end in pair if end is not None]
+        layouts = {one.topic.removeprefix(_ARTICULATION): one.layout for one in reversed(index.channels_of(_STATES))}
         return Summary(
             path=self.path,
             complete=index.complete and not self.damage,
@@ -133,6 +136,10 @@ class Run:
             topics={topic: describe_topic(topic, schemas[topic], stamps) for topic, stamps in stamps_of.items()},
             varied=tuple(self._contents(index, EpisodeMessage)),
             outcomes=self.outcomes(),
+            positions={
+                owner: dict(zip(names, quantities(layouts[owner], "qpos", names), strict=True))
+                for owner, names in self.positions().items()
+            },
         )
 
     def table(self, progress: Progress | None = None, *, fields: Collection[str] | None = None) -> Table:
@@ -246,9 +253,8 @@ class Run:
 
         with self.path.open("rb") as file:
             try:
-                attachments = make_reader(file).iter_attachments()
-                found = next((one for one in attachments if one.name == MODEL_NAME), None)
-                data = None if found is None else zlib.decompressobj().decompress(found.data, _MODEL_BYTES)
+                found = _first_model(file)
+                data = None if found is None else zlib.decompressobj().decompress(found, _MODEL_BYTES)
             except (McapError, OSError, zlib.error, struct.error) as error:
                 raise RecordingError(f"{self.path}: the model in it cannot be read: {error}.") from error
         if data is None:
@@ -440,15 +446,26 @@ def _fields(source: Source, state: ArticulationMessage | EntityMessage) -> dict[
     return own | {"sensors": sensors}
 
 
+def _first_model(file: BinaryIO) -> bytes | None:
+    """Return the first attached model as it is stored; also from a file that was cut short, which has no index."""
+    try:
+        attachments = make_reader(file).iter_attachments()
+        return next((one.data for one in attachments if one.name == MODEL_NAME), None)
+    except (McapError, struct.error):
+        file.seek(0)
+        records = StreamReader(file, emit_chunks=True).records
+        return next((one.data for one in records if isinstance(one, Attachment) and one.name == MODEL_NAME), None)
+
+
 def _shown(run: Run) -> str:
     """Return a recording for a notebook: its summary, a picture from the middle, and curves of joint positions."""
     try:
         summary, (start, end) = run.summary(), run.time_range()
         states = [run.state_at(float(time)) for time in np.linspace(start, end, _CURVE_POINTS)]
         curves = [
-            (f"{owner}/{name}", f"{number(float(values.min()))} to {number(float(values.max()))}", curve(values))
-            for owner, names in run.positions().items()
-            for name, values in zip(names, _positions(states, owner, len(names)), strict=False)
+            (f"{owner}/{name}", f"{number(float(values.min()))} to {number(float(values.max()))}", what, curve(values))
+            for owner, names in summary.positions.items()
+            for (name, what), values in zip(names.items(), _positions(states, owner, len(names)), strict=False)
         ]
         camera = next(iter(run.cameras()), None)
         middle = None if camera is None else run.picture_at(camera, (start + end) / 2)
@@ -461,7 +478,7 @@ def _shown(run: Run) -> str:
         "damage": summary.damage,
         **pictures,
     }
-    return fields(repr(run)[1:-1], said) + table(curves, caption="joint positions")
+    return fields(repr(run)[1:-1], said) + table(curves, caption=f"joint positions from {start:.2f} to {end:.2f} s")
 
 
 def _positions(states: Sequence[RecordedState | None], owner: str, count: int) -> Floats:

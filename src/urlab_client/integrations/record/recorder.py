@@ -72,7 +72,9 @@ class Recording(Block):
     def stats(self) -> RecorderStats:
         """Current counters. Thread-safe."""
         if self._writer is None:
-            return RecorderStats(states=0, frames=0, dropped_states=0, dropped_frames=0, waiting_bytes=0, file_bytes=0)
+            return RecorderStats(
+                states=0, frames=0, duration_s=0.0, dropped_states=0, dropped_frames=0, waiting_bytes=0, file_bytes=0
+            )
         return self._writer.stats
 
     @property

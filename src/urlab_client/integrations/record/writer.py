@@ -101,6 +101,7 @@ class RecorderStats(Serializable, Struct, kw_only=True, frozen=True):
     Attributes:
         states: States written.
         frames: Pictures written.
+        duration_s: Time between the first and the last state on the recording's clock, seconds.
         dropped_states: States dropped because the queue was full, or after a failure.
         dropped_frames: Pictures dropped likewise, and pictures that were due but not sent by the server.
         waiting_bytes: Approximate size of the queue's contents.
@@ -109,6 +110,7 @@ class RecorderStats(Serializable, Struct, kw_only=True, frozen=True):
 
     states: int
     frames: int
+    duration_s: float
     dropped_states: int
     dropped_frames: int
     waiting_bytes: int
@@ -151,6 +153,7 @@ class WriterThread:
         return RecorderStats(
             states=self._sink.states,
             frames=self._sink.frames,
+            duration_s=self._sink.duration_s,
             dropped_states=self._dropped_states,
             dropped_frames=self._dropped_frames,
             waiting_bytes=self._put_bytes - self._taken_bytes,
@@ -309,6 +312,7 @@ class _Sink:
     def __init__(self, file: _McapFile, options: WriterOptions, about: Mapping[str, str]) -> None:
         self.options = options
         self.states = self.frames = 0
+        self._began = 0
         self.cameras: dict[str, PictureMemory] = {}
         self._clock = SampleClock()
         self._poses = Schedule(options.pose_ns)
@@ -324,6 +328,11 @@ class _Sink:
         self._writer.start(profile="", library=f"urlab-client {version('urlab-client')}")
         started = datetime.now(UTC).isoformat(timespec="milliseconds")
         self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **about})
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds between the first and the last state."""
+        return ((self._clock.last or 0) - self._began) / 1e9
 
     def write(self, item: State | CameraPicture | EpisodeMark | Transition) -> None:
         match item:
@@ -375,6 +384,8 @@ class _Sink:
     def _write_state(self, item: State) -> None:
         reply = item.reply
         now = self._clock.advance(item.nanoseconds, item.restarts)
+        if not self.states:
+            self._began = now
         if item.scene is not self._scene:
             self._use(item.scene, now, item.wall_ns)
         episode = self._clock.episode
