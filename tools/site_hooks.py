@@ -26,8 +26,8 @@ ROOT_PAGES = {
 }
 
 # Weight of pages in the search, by how their path begins: an answer comes before a class, a class before a list.
-_BOOSTS = {"howto/": 4.0, "quickstart": 3.0, "concepts": 2.0, "tutorials/": 2.0, "reference/": 0.5, "coverage": 0.1,
-           "promises": 0.1, "evidence": 0.1, "project/": 0.3}  # fmt: skip
+_BOOSTS = {"howto/": 4.0, "quickstart": 3.0, "concepts": 2.0, "tutorials/": 2.0, "reference/blocking": 0.7,
+           "reference/": 0.5, "coverage": 0.1, "promises": 0.1, "evidence": 0.1, "project/": 0.3}  # fmt: skip
 
 _LINK = re.compile(r"(?P<picture>!?)\[(?P<text>[^]]*)\]\((?P<target>[^)\s#]+)(?P<anchor>#[^)\s]*)?\)")
 _TAB = re.compile(
@@ -62,10 +62,11 @@ def with_listed(nav: Any, docs: Path) -> Any:
     path = docs / nav if isinstance(nav, str) else None
     if path is None or not path.exists():
         return nav
-    names = re.findall(rf"\]\(({re.escape(path.stem)}-[\w-]+\.md)", path.read_text(encoding="utf-8"))
+    listed = dict.fromkeys(re.findall(rf"\]\(({re.escape(path.stem)}-[\w-]+)\.md", path.read_text(encoding="utf-8")))
+    names = [f"{name}.md" for name in listed if not any(name.startswith(f"{other}-") for other in listed)]
     below = [
         {_heading(path.parent / name): with_listed(posixpath.join(posixpath.dirname(nav), name), docs)}
-        for name in dict.fromkeys(names)
+        for name in names
     ]
     return [{_heading(path): nav}, *below] if below else nav
 

@@ -71,7 +71,9 @@ def first_hit(browser: Page, site: str, words: str) -> str:
     return address.removeprefix(f"{site}/").partition("?")[0]
 
 
-@pytest.mark.parametrize("words", ["joint position", "reset", "timeout", "save video", "set joint angles"])
+@pytest.mark.parametrize(
+    "words", ["joint position", "reset", "timeout", "save a video", "set joint angles", "how do I use the editor"]
+)
 def test_an_answer_comes_before_the_reference(browser: Page, site: str, words: str) -> None:
     assert first_hit(browser, site, words).startswith(ANSWERS)
 
@@ -81,9 +83,17 @@ def test_common_words_lead_to_an_answer(browser: Page, site: str, word: str) -> 
     assert first_hit(browser, site, word).startswith(ANSWERS)
 
 
+@pytest.mark.parametrize(
+    ("words", "page"),
+    [("what happens when the server dies", "howto/index"), ("train with Stable-Baselines3", "howto/rl")],
+)
+def test_questions_lead_to_the_page_that_answers_them(browser: Page, site: str, words: str, page: str) -> None:
+    assert first_hit(browser, site, words).startswith(page)
+
+
 @pytest.mark.parametrize("name", ["set_ctrl", "state_stream"])
-def test_names_of_the_api_lead_to_the_reference(browser: Page, site: str, name: str) -> None:
-    assert first_hit(browser, site, name).startswith("reference/")
+def test_names_of_the_api_lead_to_the_blocking_reference(browser: Page, site: str, name: str) -> None:
+    assert first_hit(browser, site, name).startswith("reference/blocking")
 
 
 @pytest.mark.parametrize(
