@@ -76,6 +76,7 @@ def test_what_cannot_be_done_together(
         (["record", "run.mcap", "sim://arm"], "'run.mcap' is a recording, not the address of a server"),
         (["ping", "run.mcap"], "'run.mcap' is a recording, not the address of a server"),
         (["console", "pictures/run.png"], "'pictures/run.png' is a file, not the address of a server"),
+        (["console", "/"], "'/' is a folder, not the address of a server"),
     ],
 )
 def test_files_and_addresses_are_told_apart(
@@ -84,6 +85,12 @@ def test_files_and_addresses_are_told_apart(
     with pytest.raises(SystemExit, match="2"):
         main(arguments)
     assert said in capsys.readouterr().err
+
+
+def test_an_unknown_option_is_named_before_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["convert", "--hep=1"])
+    assert capsys.readouterr().err.startswith("urlab convert: --hep is not an option. Did you mean '--help'")
 
 
 @pytest.mark.parametrize("command", [["ping", "--timeout", "0.1"], ["ping", "--no-session", "--timeout", "0.1"]])

@@ -84,6 +84,61 @@ def test_the_robots_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(Path(robot["path"]).is_file() for robot in listed)
 
 
+def test_the_names_in_a_robot_are_listed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["robots", "arm"]) == 0
+    lines = dict(line.split(None, 1) for line in capsys.readouterr().out.splitlines())
+    assert lines["actuators"].split(", ")[-2:] == ["wrist_yaw", "gripper"]
+    assert lines["cameras"] == "overview, wrist"
+    file = tmp_path / "bob.xml"
+    joints = '<joint name="swing"/><joint axis="1 0 0"/>'
+    file.write_text(f'<mujoco><worldbody><body>{joints}<geom size=".1"/></body></worldbody></mujoco>')
+    assert main(["robots", str(file), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == {
+        "name": "bob", "joints": ["swing", "(unnamed)"], "actuators": [], "sensors": [], "cameras": [], "keyframes": [],
+        "path": str(file),
+    }  # fmt: skip
+    assert main(["robots", str(file)]) == 0
+    assert "cameras    none" in capsys.readouterr().out
+    file.write_text("<mujoco><worldbody><geom/></worldbody></mujoco>")
+    assert main(["robots", str(file)]) == 2
+    assert f"urlab robots: MuJoCo rejects {file}: " in capsys.readouterr().err
+    assert main(["robots", "harm"]) == 2
+    assert "Did you mean 'arm'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "record sim://arm --seconds 1 run.mcap --contacts",
+        "record --contacts sim://arm run.mcap --seconds=1",
+        "record sim://arm run.mcap --contacts --seconds 1",
+    ],
+)
+def test_options_may_stand_between_arguments(line: str) -> None:
+    found = _parser("record").parse_args(line.split())
+    assert (found.address, str(found.output), found.seconds, found.contacts) == ("sim://arm", "run.mcap", 1.0, True)
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"),
+    [
+        ("plot run.mcap --joints a b -o a.png", {"joints": ["a", "b"]}),
+        ("plot --joints a b -o a.png run.mcap", {"joints": ["a", "b"]}),
+        ("run-policy --command -1 0.5 0 walk.onnx", {"command": [-1.0, 0.5, 0.0]}),
+    ],
+)
+def test_options_with_several_values_keep_them(line: str, wanted: dict[str, object]) -> None:
+    found = vars(_parser(line.partition(" ")[0]).parse_args(line.split()))
+    assert {name: found[name] for name in wanted} == wanted
+
+
+def test_what_was_meant_comes_before_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["recrd"])
+    assert "'recrd' is not known. Did you mean 'record'? There are: serve, console," in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [

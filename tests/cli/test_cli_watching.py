@@ -15,6 +15,7 @@ from relay import Relay
 from waiting import eventually, until
 
 from urlab_client.aio import URLabClient
+from urlab_client.aio.explain import watched
 from urlab_client.cli import _watching, main
 from urlab_client.cli._common import CommandError
 from urlab_client.cli._watching import run_session
@@ -77,6 +78,21 @@ async def test_what_a_server_simulated_before_does_not_count(server: SimulatedSe
         await run_session(client, 0.2, over=lambda: False, progress=passed.append)
         assert client.sim_time >= 0.4 + 0.2 - 1e-9
     assert passed[0] < 0.2 <= passed[-1] + 1e-9
+
+
+@pytest.mark.parametrize("paused", [True, False])
+async def test_physics_is_left_as_it_was(
+    server: SimulatedServer, paused: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with URLabClient(**server.client_options(), step_mode="live") as client:
+        await client.discover()
+        await client.runtime.set_paused(paused)
+        await run_session(client, 0.1, over=lambda: False)
+        assert client.sim_time >= 0.1
+        assert ("physics was paused: it runs until this command ends" in capsys.readouterr().err) == paused
+        before = await client.sim.status()
+        after = await watched(client.sim.status, before)
+        assert (after.sim_time == before.sim_time) == paused
 
 
 async def test_resets_do_not_prolong_it(server: SimulatedServer) -> None:

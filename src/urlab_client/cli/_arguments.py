@@ -62,15 +62,40 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
         """See `argparse.ArgumentParser.parse_known_args`; a command's parser rejects unknown arguments."""
-        found, unknown = super().parse_known_args(args, namespace)
+        found, unknown = super().parse_known_args(args and self._arguments_first(args), namespace)
         if unknown:
-            word = unknown[0]
-            if not word.startswith("-"):
-                self.error(f"{word!r} is one argument too many")
-            option = word.partition("=")[0]
-            options = [name for action in self._actions for name in action.option_strings]
-            self.error(f"{option} is not an option.{did_you_mean(option, options)}")
+            if unknown[0].startswith("-"):
+                self._refuse_option(unknown[0])
+            self.error(f"{unknown[0]!r} is one argument too many")
         return found, unknown
+
+    def _refuse_option(self, word: str) -> NoReturn:
+        option = word.partition("=")[0]
+        self.error(f"{option} is not an option.{did_you_mean(option, self._option_string_actions)}")
+
+    def _arguments_first(self, words: Sequence[str]) -> Sequence[str]:
+        """Put what is no option first: argparse gives as many arguments as it can to the words before an option.
+
+        An unknown option is refused here, before argparse says what is missing.
+        """
+        arguments, options, left = list[str](), list[str](), list(words)
+        while left:
+            name, equals, _ = (word := left.pop(0)).partition("=")
+            option = self._option_string_actions.get(name)
+            if self.commands or word == "--":
+                return words
+            if option is None and word.startswith("--"):
+                self._refuse_option(word)
+            if option is None and word.startswith("-") and word != "-":  # with its value, or not one either
+                return words
+            (arguments if option is None else options).append(word)
+            if option is None or equals:
+                continue
+            most = option.nargs if isinstance(option.nargs, int) else 1 if option.nargs in (None, "?") else len(left)
+            while most > 0 and left and left[0].partition("=")[0] not in self._option_string_actions:
+                options.append(left.pop(0))
+                most -= 1
+        return [*arguments, *options]
 
     def error(self, message: str) -> NoReturn:
         """See `argparse.ArgumentParser.error`."""
@@ -317,7 +342,8 @@ def address(text: str) -> str:
     if text.endswith(".mcap"):
         raise argparse.ArgumentTypeError(f"{text!r} is a recording, not the address of a server")
     if "/" in text or Path(text).is_file():
-        raise argparse.ArgumentTypeError(f"{text!r} is a file, not the address of a server")
+        what = "folder" if Path(text).is_dir() else "file"
+        raise argparse.ArgumentTypeError(f"{text!r} is a {what}, not the address of a server")
     return f"tcp://{text}"
 
 
@@ -344,7 +370,7 @@ def image_size(text: str) -> tuple[int, int]:
 
 
 def _not_one_of(value: str, known: Sequence[str]) -> str:
-    return f"{value!r} is not one of {', '.join(known)}.{did_you_mean(value, known)}"
+    return f"{value!r} is not known.{did_you_mean(value, known)} There are: {', '.join(known)}"
 
 
 def _whole(low: int, high: int, advice: str) -> Callable[[str], int]:

@@ -13,6 +13,7 @@ import signal
 import socket
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -120,6 +121,10 @@ async def serve(
                 await super().shutdown(sockets)
             finally:
                 cancelling.cancel()
+
+        def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            if not self.should_exit:  # a second one would break off the application's clean-up, which is bounded
+                super().handle_exit(sig, frame)
 
         async def on_tick(self, counter: int) -> bool:
             return await super().on_tick(counter) or (ended is not None and ended.is_set())

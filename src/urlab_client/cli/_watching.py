@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from urlab_client.cli._arguments import cameras, make_client
 from urlab_client.cli._common import CommandError, in_background, refusing
 from urlab_client.enums import StepMode
-from urlab_client.errors import OutcomeUnknown, URLabTimeoutError
+from urlab_client.errors import OutcomeUnknown, UnknownOp, URLabError, URLabTimeoutError
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient
@@ -65,7 +65,7 @@ async def run_session(
     over: Callable[[], bool],
     progress: Callable[[float], None] = lambda _: None,
 ) -> None:
-    """Let simulation time pass: unpause in live mode, else step.
+    """Let simulation time pass: unpause in live mode for as long as it takes, else step.
 
     Args:
         client: The client.
@@ -81,9 +81,7 @@ async def run_session(
     start = last = math.inf
     done = 0.0
     lost_at: float | None = None
-    async with client.events() as events:
-        if not direct:
-            await client.runtime.set_paused(False)
+    async with client.events() as events, contextlib.nullcontext() if direct else _running(client):
         state_due = asyncio.get_running_loop().time() + _FIRST_STATE_S
         while not over():
             if direct or client.recv_wall_time_ns:  # otherwise no state has come yet
@@ -104,6 +102,28 @@ async def run_session(
                         f"no state arrived within {_FIRST_STATE_S:g} s; if the server's state stream has a port of its "
                         "own, pass --state-port (`urlab serve` prints it)"
                     )
+
+
+@contextlib.asynccontextmanager
+async def _running(client: URLabClient) -> AsyncGenerator[None]:
+    """Let physics run; pause it at the end if it was paused, unless the server is this command's own."""
+    from urlab_client.aio.explain import watched
+
+    paused = False
+    if not client.address.startswith("sim://"):
+        with contextlib.suppress(UnknownOp):  # a packaged build does not tell
+            first = await client.sim.status()
+            after = await watched(client.sim.status, first)
+            paused = after.sim_time is not None and after.sim_time == first.sim_time
+    if paused:
+        print("physics was paused: it runs until this command ends", file=sys.stderr, flush=True)
+    await client.runtime.set_paused(False)
+    try:
+        yield
+    finally:
+        if paused:
+            with contextlib.suppress(URLabError):  # the server may be gone
+                await client.runtime.set_paused(True)
 
 
 def recording_options(arguments: Namespace) -> dict[str, Any]:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from urlab_client.integrations.record import Run
 
 _FORMATS = ("csv", "npz", "parquet", "mp4", "lerobot")
+_PAIRS = "rows: states, with the actions that followed"
 
 USAGE = f"""
 {RECORDING}
@@ -78,18 +79,18 @@ def _writer(kind: str, recording: Run, arguments: Namespace, left_out: Counter[s
     pairs: dict[str, Any] = {"episodes": arguments.episodes, "left_out": left_out}
     match kind:
         case "csv":
-            return partial(export.write_csv, recording, **pairs), "rows"
+            return partial(export.write_csv, recording, **pairs), _PAIRS
         case "parquet":
-            return partial(export.write_parquet, recording, **pairs), "rows"
+            return partial(export.write_parquet, recording, **pairs), _PAIRS
         case "npz":
             return partial(export.write_npz, recording, cameras=cameras), "states"
         case "mp4":
             if len(cameras) != 1:
                 there = cameras or recording.cameras()
+                if not there:
+                    raise CommandError(f"{arguments.recording} has no pictures; `urlab record --camera` records them")
                 if cameras or len(there) != 1:
-                    raise CommandError(
-                        f"a video shows one camera: give one --camera; there are {', '.join(there) or 'none'}"
-                    )
+                    raise CommandError(f"a video shows one camera: give one --camera; there are {', '.join(there)}")
                 cameras = there
             return partial(export.write_mp4, recording, camera=cameras[0]), "pictures"
         case _:

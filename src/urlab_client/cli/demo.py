@@ -81,7 +81,7 @@ def run(arguments: Namespace) -> int:
         picture = "not drawn: --no-render" if arguments.no_render else _draw(server, folder / "last_state.png")
     with _serving([str(file), str(file), *floor], arguments.dialect) as (_, options):
         runs.append(asyncio.run(_drive_two(options, max(1, steps // _ASYNC_SHARE))))
-    print(f"{file.stem}, direct mode", _table(runs), sep="\n")
+    print(f"{file.stem}, direct mode", _table(runs, poses=one.free), sep="\n")
     if runs[0]["controllers"] == ["none"]:
         print(f"{file.stem}: 0 actuators: nothing is driven; gravity alone moves it.")
     one.plot(f"{file.stem}, {steps} steps through the blocking client", folder / "joints.png")
@@ -159,14 +159,14 @@ def _draw(server: SimulatedServer, file: Path) -> str:
     return "last state of the blocking run"
 
 
-def _table(runs: list[dict[str, Any]]) -> str:
+def _table(runs: list[dict[str, Any]], *, poses: bool) -> str:
     headings = "client", "robots", "steps", "sim (s)", "steps/s", "real-time factor"
-    rows = [[*headings, "final base pose: x y z (m), quaternion w x y z"]]
+    rows = [[*headings, "final base pose: x y z (m), quaternion w x y z" if poses else ""]]
     for one in runs:
         numbers = "{robots} {steps} {sim_time:.3f} {steps_per_second:.0f} {real_time_factor:.2f}".format(**one)
-        first, *others = [" ".join(f"{value:6.3f}" for value in pose) for pose in one["final_base_poses"]]
-        rows.append([one["client"], *numbers.split(), first])
-        rows += [[*[""] * len(headings), pose] for pose in others]
+        shown = [" ".join(f"{value:6.3f}" for value in pose) for pose in one["final_base_poses"]] if poses else [""]
+        rows.append([one["client"], *numbers.split(), shown[0]])
+        rows += [[*[""] * len(headings), pose] for pose in shown[1:]]
     return aligned(rows, right=range(1, len(headings)))
 
 
@@ -282,6 +282,11 @@ class Run:
         self._times: list[float] = []
         self._positions: list[Floats] = []
         self._began = time.perf_counter()
+
+    @property
+    def free(self) -> bool:
+        """Whether the first robot can go elsewhere, so that it matters where it ends."""
+        return self._robots[0].has_free_base
 
     def act(self) -> None:
         """Write all set-points for the next step."""

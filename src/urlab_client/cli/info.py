@@ -69,6 +69,8 @@ def _print(summary: Summary) -> None:
         longest = f"{topic.longest_gap_s:.3f}" if topic.longest_gap_s else ""
         rows.append((topic.name, topic.schema, str(topic.messages), rate, str(topic.gaps), longest))
     print(aligned(rows, right=range(2, 6)))
+    for robot, names in summary.positions.items():
+        print(f"positions of {robot}: {', '.join(names)}")
 
 
 def _print_varied(summary: Summary) -> None:

@@ -65,9 +65,10 @@ def run(arguments: Namespace) -> int:
         for quantity, chosen in places.items():
             labels = [column.labels[place] for place in chosen]
             curves.append(Curves(f"{owner}\n{quantity}", labels, column.values[:, chosen]))
+    replaces = ", instead of the file that was there" if target.exists() else ""
     plot_curves(arguments.recording.name, table.time, curves, target)
     drawn = sum(len(one.names) for one in curves)
-    print(f"{target}  {counted(drawn, 'curve')}, {counted(len(table), 'state')}")
+    print(f"{target}  {counted(drawn, 'curve')}, {counted(len(table), 'state')}{replaces}")
     return 0
 
 

@@ -1,11 +1,12 @@
 """`urlab record`: record a run to a file.
 
 Record states, poses and pictures of a play session to a file that Foxglove opens. In live mode, physics runs by itself
-and this command watches; in direct mode, this command resets and steps it, with all set-points zero or those of the
-keyframe. With --task, it runs episodes of a task, with actions of zero, and records rewards, success and goals, too.
-Opens a session, which takes the server over from the client that drives it; your own program can call
-record(client, FILE) instead. Ctrl-C ends the recording early. Exit code 1 if states were dropped or a camera sent no
-picture. Needs the extra 'urlab-client[mcap]', and with --task also 'urlab-client[gym]'.
+and this command watches; if it is paused, it runs until the end of the recording. In direct mode, this command resets
+and steps it, with all set-points zero or those of the keyframe. With --task, it runs episodes of a task, with actions
+of zero, and records rewards, success and goals, too. Opens a session, which takes the server over from the client that
+drives it; your own program can call record(client, FILE) instead. Ctrl-C ends the recording early. Exit code 1 if
+states were dropped or a camera sent no picture. Needs the extra 'urlab-client[mcap]', and with --task also
+'urlab-client[gym]'.
 """
 
 from __future__ import annotations

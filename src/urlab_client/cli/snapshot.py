@@ -61,6 +61,8 @@ def run(arguments: Namespace) -> int:
     _check_mode(arguments)
     if recordings := [source for source in arguments.sources if source.endswith(".mcap")]:
         raise CommandError(f"{recordings[0]} is a recording; urlab plot, view and console show it")
+    if pictures := [source for source in arguments.sources if source.endswith((*_FORMATS, ".gif"))]:
+        raise CommandError(f"{pictures[0]} is a picture, not a model; write to it with -o {pictures[0]}")
     import_mujoco()
     if any("://" in source for source in arguments.sources):
         image = _of_running_server(arguments)
