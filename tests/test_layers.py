@@ -28,7 +28,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_mujoco": frozenset(),
     "_installation": frozenset(),
     "aio": VALUES | {"_installation", "events", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
-    "sync": VALUES | {"aio", "events", "protocol", "types"},
+    "sync": VALUES | {"_platform", "aio", "events", "protocol", "types"},
     "randomise": VALUES | {"_mujoco", "protocol"},
     "simulation": VALUES | {"_mujoco", "_platform", "protocol", "randomise"},
     "server": VALUES

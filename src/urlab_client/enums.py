@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Final, Literal, TypeAlias, TypeVar
+from typing import Final, Literal, Self, TypeAlias, TypeVar
 
 __all__ = [
     "ActuatorType",
@@ -30,7 +30,16 @@ __all__ = [
 E = TypeVar("E", bound=StrEnum)
 
 
-class StepMode(StrEnum):
+class Word(StrEnum):
+    """One of several words; the error about any other word lists them."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Self | None:
+        *words, last = map(repr, map(str, cls))
+        raise ValueError(f"{value!r:.80} is not a valid {cls.__name__}: use {', '.join(words)} or {last}.")
+
+
+class StepMode(Word):
     """What advances physics."""
 
     AUTO = "auto"
@@ -39,8 +48,9 @@ class StepMode(StrEnum):
     LIVE = "live"
 
     @classmethod
-    def _missing_(cls, value: object) -> StepMode | None:
-        return next((mode for mode, later in LATER_MODE_NAMES.items() if later == value), None)
+    def _missing_(cls, value: object) -> Self | None:
+        found = next((mode for mode, later in LATER_MODE_NAMES.items() if later == value), None)
+        return super()._missing_(value) if found is None else cls(found)
 
 
 LATER_MODE_NAMES: Final[Mapping[StepMode, str]] = {
@@ -55,14 +65,14 @@ StepModeName: TypeAlias = Literal["auto", "direct", "puppet", "live"]
 """A step mode, by name."""
 
 
-class ControlMode(StrEnum):
+class ControlMode(Word):
     """What turns set-points into actuator signals."""
 
     UE_CONTROLLER = "ue_controller"
     RAW = "raw"
 
 
-class ActuatorType(StrEnum):
+class ActuatorType(Word):
     """MJCF actuator element. The plugin reports `<general>` as `MOTOR`; the client classifies it by gain and bias."""
 
     MOTOR = "motor"
@@ -76,19 +86,19 @@ class ActuatorType(StrEnum):
     DC_MOTOR = "dcmotor"
 
 
-class ControllerKind(StrEnum):
+class ControllerKind(Word):
     """Kind of the controller attached to an articulation."""
 
     PD = "pd"
     PASSTHROUGH = "passthrough"
 
     @classmethod
-    def _missing_(cls, value: object) -> ControllerKind | None:
+    def _missing_(cls, value: object) -> Self | None:
         # The plugin calls its passthrough controller "base".
-        return cls.PASSTHROUGH if value == "base" else None
+        return cls("passthrough") if value == "base" else super()._missing_(value)
 
 
-class CameraMode(StrEnum):
+class CameraMode(Word):
     """Meaning of a camera's pixels."""
 
     REAL = "real"
@@ -97,14 +107,14 @@ class CameraMode(StrEnum):
     INSTANCE = "instance"
 
 
-class CameraTiming(StrEnum):
+class CameraTiming(Word):
     """Which frame a step reply carries: one rendered after the step, or the newest available."""
 
     SYNC = "sync"
     LATEST = "latest"
 
 
-class ObservationLevel(StrEnum):
+class ObservationLevel(Word):
     """Amount of state in each step reply."""
 
     MINIMAL = "minimal"
@@ -116,7 +126,7 @@ ObservationLevelName: TypeAlias = Literal["minimal", "standard", "full"]
 """An observation level, by name."""
 
 
-class OutOfRange(StrEnum):
+class OutOfRange(Word):
     """Handling of a set-point outside the range of its actuator. Client-side only."""
 
     ERROR = "error"
@@ -127,7 +137,7 @@ class OutOfRange(StrEnum):
     """Send it unchanged; MuJoCo clamps controls that have a range."""
 
 
-class PIEState(StrEnum):
+class PIEState(Word):
     """State of Play-In-Editor."""
 
     READY = "ready"
@@ -137,7 +147,7 @@ class PIEState(StrEnum):
     COMPILING = "compiling"
 
 
-class Transport(StrEnum):
+class Transport(Word):
     """Transport of requests."""
 
     ZMQ = "zmq"

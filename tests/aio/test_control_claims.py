@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+from typing import Any
 
 import pytest
 from hello import hello_ok
@@ -15,7 +16,7 @@ from waiting import DEADLINE_S, pass_time, until
 from urlab_client import ControlClaimed, NotControlOwner
 from urlab_client.aio import URLabClient
 from urlab_client.aio.session.control import process_owner
-from urlab_client.errors import UnknownArticulation
+from urlab_client.errors import UnknownArticulation, URLabTimeoutError
 from urlab_client.protocol.messages.runtime import ReleaseControl
 
 OURS = process_owner()
@@ -191,6 +192,21 @@ async def test_closing_gives_up_what_is_owned(beta: ScriptedBeta) -> None:
         await client.articulations["arm_C_1"].claim(ttl=0)
         await client.step()
         assert set(beta.owners) == {"arm_C_0", "arm_C_1"}
+    assert beta.owners == {}
+
+
+async def test_closing_gives_up_a_claim_whose_answer_was_lost(beta: ScriptedBeta) -> None:
+    grant = beta.answers["claim_control"]
+
+    def lost(request: dict[str, Any]) -> None:
+        grant(request)
+
+    async with client_of(beta, step_mode="direct") as client:
+        await client.discover()
+        beta.on("claim_control", lost)
+        with pytest.raises(URLabTimeoutError):
+            await client.articulations["arm_a"].claim(ttl=0, timeout=0.5)
+        assert beta.owners == {"arm_C_0": OURS}
     assert beta.owners == {}
 
 

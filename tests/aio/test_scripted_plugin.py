@@ -421,7 +421,7 @@ async def test_keyframes_by_their_short_name(plugin: Any, connect: Any) -> None:
         assert plugin.requests[-1]["keyframe_name"] == "robot_2_squat"
         with pytest.raises(UnknownKeyframe, match="could mean 'robot_home' or 'arm_C_0_home'"):
             await client.reset(keyframe_name="home")
-        with pytest.raises(UnknownKeyframe, match="Known: 'robot_home', 'arm_C_0_home' and 'robot_2_squat'"):
+        with pytest.raises(UnknownKeyframe, match="Known: 'robot_home', 'arm/home' and 'squat'"):
             await client.reset(keyframe_name="sleep")
 
 
@@ -624,8 +624,17 @@ async def test_an_op_the_server_lacks_is_refused_before_sending(plugin: Any, scr
     scripted.on("meta", {"op": "meta_ok", "ops": [{"name": "step", "category": "manager_required", "namespace": ""}]})
     async with connect(step_mode="auto") as client:
         await client.discover()
-        with pytest.raises(UnknownOp, match="Nothing was sent"):
+        with pytest.raises(UnknownOp, match="Nothing was sent") as refused:
             await client.scene.current_level()
+    assert refused.value.op == "current_level"
+
+
+async def test_a_server_that_cannot_list_its_ops_is_asked_for_them(plugin: Any, scripted: Any, connect: Any) -> None:
+    scripted.on("meta", {"op": "error", "code": "unknown_op", "message": "meta"})
+    scripted.on("current_level", {"op": "current_level_ok", "level_path": "/Game/Levels/lab"})
+    async with connect() as client:
+        await client.discover()
+        assert await client.scene.current_level() == "/Game/Levels/lab"
 
 
 async def test_a_newer_server_may_say_more(plugin: Any, scripted: Any, connect: Any) -> None:

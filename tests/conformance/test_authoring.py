@@ -10,7 +10,7 @@ import pytest
 
 from urlab_client import NoActiveManager, PIEState, URLabAsset, URLabPIEError
 from urlab_client.enums import StepMode
-from urlab_client.errors import CreateLevelFailed, ImportFailed, SpawnFailed, TooManyCells, Unsupported
+from urlab_client.errors import CreateLevelFailed, ImportFailed, LoadLevelFailed, SpawnFailed, TooManyCells, Unsupported
 
 BOX = """
 <mujoco model="box"><worldbody><body name="box" pos="0 0 1"><freejoint name="root"/>
@@ -197,3 +197,12 @@ async def test_meta_lists_the_ops(connect: Any, empty: Any, dialect: str) -> Non
     names = {op.name for op in await client.meta()}
     assert len(names) == {"alpha": 62, "beta": 73}[dialect]
     assert {"step", "spawn_actor", "draw_axes"} <= names
+
+
+async def test_a_start_that_is_refused_leaves_play_as_it_was(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        with pytest.raises(LoadLevelFailed, match="/Game/Levels/nowhere"):
+            await client.sim.start("/Game/Levels/nowhere")
+        assert (await client.step(2)).step == 2

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import socket
+from pathlib import Path
 from typing import Any
+
+import pytest
 
 from urlab_client.server import ControllerConfig
 from urlab_client.types import Verdict
@@ -20,7 +24,8 @@ async def test_nobody_there(connect: Any) -> None:
     client = connect(address="tcp://127.0.0.1", step_port=port, rcv_timeout_ms=500)
     diagnosis = await client.explain()
     assert not diagnosis.healthy
-    assert f"127.0.0.1:{port}: Connection refused; is the server running" in problems(diagnosis)
+    (finding,) = diagnosis.findings  # what else does not work follows from it
+    assert finding.text.startswith(f"127.0.0.1:{port}: Connection refused; is the server running")
 
 
 async def test_a_state_stream_that_cannot_be_reached_is_a_note(connect: Any, serve: Any) -> None:
@@ -34,7 +39,9 @@ async def test_a_state_stream_that_cannot_be_reached_is_a_note(connect: Any, ser
 
 
 async def test_the_default_port_of_the_state_stream_is_tried(connect: Any) -> None:
-    diagnosis = await connect(address="tcp://localhost", step_port=1, rcv_timeout_ms=300).explain()
+    with socket.create_server(("localhost", 0)) as silent:
+        port = silent.getsockname()[1]
+        diagnosis = await connect(address="tcp://localhost", step_port=port, rcv_timeout_ms=300).explain()
     (found,) = [finding for finding in diagnosis.findings if finding.subject == "state stream"]
     tried = ("localhost:5555 accepts connections.", "localhost:5555: Connection refused")  # something may listen there
     assert found.text.startswith(tried)
@@ -190,3 +197,30 @@ async def test_set_points_beyond_their_range_are_a_note(connect: Any, serve: Any
         (note,) = [one for one in (await client.explain()).findings if one.text.startswith("Set-points out of range")]
         assert note.verdict is Verdict.NOTE
         assert "elbow" in note.text
+
+
+async def test_a_simulation_that_diverges(
+    connect: Any, serve: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = tmp_path / "stiff.xml"
+    model.write_text("""<mujoco><option timestep="0.02" integrator="Euler"/><worldbody><body gravcomp="1">
+      <joint name="j" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".1"/></body></worldbody>
+    <actuator><general name="a" joint="j" gainprm="1e7" biastype="affine" biasprm="0 -1e7 -1e5"/></actuator>
+    </mujoco>""")
+    with serve(str(model), play=True, mjcf_options=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        await client.step(5)
+        assert not problems(await client.explain())
+        client.articulations["stiff"].set_ctrl({"a": 1.0})
+        for _ in range(6):
+            await client.step()
+        said = problems(await client.explain())
+        assert "it has diverged: try a shorter timestep, or weaker gains" in said
+        assert "not applied" not in said, "that follows from it"
+        told = [one.getMessage() for one in caplog.records if "in a step: it diverged" in one.getMessage()]
+        assert re.match(r"simulation time went from 0\.1\d* s to 0\.02 s", told[0])
+        await client.reset()
+        client.articulations["stiff"].set_ctrl({"a": 0.0})
+        await client.step(2)
+        assert not problems(await client.explain()), "a reset begins anew"

@@ -411,7 +411,7 @@ def test_what_a_server_refuses_is_not_asked_again(cluster: Any) -> None:
     from urlab_client.cluster import RolloutError, rollouts
 
     options = OPTIONS | {"env_options": {"keyframe": "away"}}
-    with pytest.raises(RolloutError, match=r"Episode 0 raised UnknownKeyframe: .*arm_home"):
+    with pytest.raises(RolloutError, match=r"Episode 0 raised UnknownKeyframe: .*Known: 'home'"):
         list(rollouts(noisy(), "sim://arm", 2, n_workers=1, **options))
 
 

@@ -463,6 +463,8 @@ def test_a_fall_is_counted_and_the_robot_starts_again(quadruped: URLabClient) ->
     policy = policy_of(text, lambda _: np.array([1.0, 1.0]))
     found = run_blocking(quadruped, policy, seconds=2.0, on_action=lambda so_far: attempts.append(so_far.falls))
     assert found.falls >= 2
+    falls = np.flatnonzero(np.diff([*attempts, found.falls]))
+    assert np.diff(falls).min() > 2, "one that lies has fallen with each action"
     assert found.upright_time == pytest.approx(0.02 * (attempts.count(0)))
     assert found.sim_time == pytest.approx(2.0)
 

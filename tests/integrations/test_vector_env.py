@@ -201,7 +201,7 @@ def test_a_refusal_is_raised_and_costs_no_server(made: list[Any]) -> None:
         env = URLabVectorEnv(addresses, max_episode_steps=1)
         made.append(env)
         action = np.zeros(env.action_space.shape)
-        with pytest.raises(urlab_client.UnknownKeyframe, match="arm_home") as caught:
+        with pytest.raises(urlab_client.UnknownKeyframe, match="Known: 'home'") as caught:
             env.reset(options={"keyframe": "away"})
         assert caught.value.__notes__[-1].startswith("environment 0 at")
         env.reset(options={"keyframe": "home"})

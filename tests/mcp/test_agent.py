@@ -377,10 +377,10 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
             assert again["done"].startswith("Placed: b2. Removed: b1.")
             assert (await one.call("state", robot="b2"))["pose"]["position"] == [2, 2, 2]
             assert (await one.call("remove", actor="b2"))["objects"] == []
-            await one.call("play", action="stop")
+            assert (await one.call("play", action="stop"))["done"].startswith("Play has ended.")
             for tool, arguments in (("state", {"robot": "arm"}), ("run", {"steps": 1}), ("contacts", {})):
                 assert "play with action='start'" in await one.refused(tool, **arguments)
-            await one.call("play", action="start")
+            assert (await one.call("play", action="start"))["done"] == "Play has started."
             await one.call("state", robot="arm")
             assert one.console.cameras.feed("arm/wrist") is not None
             await one.call("remove", actor="arm")

@@ -8,7 +8,9 @@ BLOCKED = """
 import asyncio, time
 from urlab_client.aio import URLabClient
 from urlab_client.aio.transport import connection, subscriber
-from urlab_client.server import SimulatedServer
+from urlab_client.server import SimulatedServer, open_server
+
+open_server.CLOSE_S = 60.0  # on a busy machine its threads take longer to end
 
 async def main():
     async with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:

@@ -126,6 +126,26 @@ def test_sizes_that_are_none_are_the_default_ones(wire: Wire, op: str, field: st
         assert drawn(**{field: 0.0}) == drawn(**{field: -1.0}) == drawn(**{field: math.inf}) == expected
 
 
+@pytest.mark.parametrize(
+    ("fields", "edges"),
+    [
+        ({"to": [0, 0, 1.34e154]}, 4),  # its square is larger than any number
+        ({"from": [-1.7e308, 0, 0], "to": [1.7e308, 0, 0]}, 0),
+        ({"to": [1, 1, 0], "arrow_size": 1.79e308}, 0),
+        ({"from": [1, 2, 3], "to": [1, 2, 3]}, 0),
+    ],
+)
+def test_an_arrow_of_any_size_is_drawn_and_has_a_head_where_there_is_room(
+    wire: Wire, fields: dict[str, Any], edges: int
+) -> None:
+    wire.ask("clear_markers")
+    wire.ask("draw_arrow", **VALID["draw_arrow"] | fields, ttl=-1)
+    (drawn,) = wire.core.drawings.take_frame(in_play=False)
+    assert len(drawn) == 1 + edges
+    places = [value for stroke in drawn for value in (*stroke.at, *(stroke.end or ()))]
+    assert all(map(math.isfinite, places))
+
+
 def test_a_label_without_a_time_to_live_stays(wire: Wire) -> None:
     wire.ask("clear_markers")
     wire.ask("draw_marker", **VALID["draw_marker"], label="here")

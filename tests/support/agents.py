@@ -8,6 +8,7 @@ from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import Any
 
+from jsonschema import Draft202012Validator
 from mcp import Client
 from mcp.types import CallToolResult
 
@@ -35,12 +36,16 @@ class Desk:
         self.console = console
         self.agent = agent
         self.mcp = mcp
+        self._schemas: dict[str, dict[str, Any] | None] = {}
 
     async def call(self, tool: str, **arguments: Any) -> dict[str, Any]:
         """Call a tool that succeeds, and return its structured result."""
         result = await self.mcp.call_tool(tool, arguments)
         assert not result.is_error, text_of(result)
         assert json.loads(text_of(result)) == result.structured_content
+        if not self._schemas:
+            self._schemas = {one.name: one.output_schema for one in (await self.mcp.list_tools()).tools}
+        Draft202012Validator(self._schemas[tool] or {}).validate(result.structured_content)
         return dict(result.structured_content or {})
 
     async def refused(self, tool: str, **arguments: Any) -> str:

@@ -25,7 +25,10 @@ LEFT_OUT = {
     *("add_observer", "remove_observer", "acquire_lease", "release_lease"),
 }
 
-PYTHONS_OWN = re.compile(r"object is not|has no|not supported between|unsupported operand|must be real|expected str")
+PYTHONS_OWN = re.compile(
+    r"object is not|object has no |not supported between|unsupported operand|must be real|expected str"
+    r"|unhashable|is not a valid (?!\w+: use )|could not convert|^None$|^'[^']*'$"
+)
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +51,9 @@ def noting(unnamed: list[str], shown: str) -> Iterator[None]:
     """Let a call fail that says what was wrong, and note one whose error is Python's own."""
     try:
         yield
-    except (URLabError, ValueError, KeyError, OSError):
+    except (URLabError, OSError):
         pass
-    except TypeError as error:
+    except (TypeError, ValueError, KeyError) as error:
         if PYTHONS_OWN.search(str(error)):
             unnamed.append(f"{shown}: {error}")
     except Exception as error:  # noqa: BLE001

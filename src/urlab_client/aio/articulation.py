@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from urlab_client.aio.arguments import finite, finite_array, mapping, require
+from urlab_client.aio.arguments import finite, finite_array, mapping, require, text
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.controllers import URLabController, make_controller
 from urlab_client.aio.defaults import DEFAULT, Timeout
@@ -159,7 +159,7 @@ class URLabEntity(Local):
         return f"<{type(self).__name__} {self.name!r}>"
 
     def _repr_html_(self) -> str | None:
-        return fields(repr(self)[1:-1], self.describe()._shown())  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+        return fields(repr(self)[1:-1], self.describe().to_dict())
 
 
 class LocalArticulation(URLabEntity):
@@ -168,6 +168,9 @@ class LocalArticulation(URLabEntity):
     __slots__ = ()
 
     _state: MirroredArticulation  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name!r} {len(self.joints)} joints, {len(self.actuators)} actuators>"
 
     @property
     def prefix(self) -> str:
@@ -362,7 +365,7 @@ class LocalArticulation(URLabEntity):
         """
         bodies = self.bodies
         if body and bodies:
-            body = bodies[body].name
+            body = bodies[text("apply_xfrc: body", body)].name
         elif not body:
             body = next((name for name, handle in bodies.items() if handle.id == self.body_id), "")
         if not body:

@@ -12,7 +12,7 @@ from functools import partial
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar, cast
 
-from urlab_client.aio.arguments import integer, require
+from urlab_client.aio.arguments import integer, require, text
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.background import running_loop
 from urlab_client.aio.cameras import URLabCameraView
@@ -629,7 +629,10 @@ class URLabClient(ClientState):
                 "row_stream: this server publishes no rows, and deriving them from snapshots requires a local model.",
                 hint="Create the client with local_model=True, or use state_stream().",
             )
-        keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
+        if articulation is None:
+            keys = list(self.articulations)
+        else:
+            keys = [self.articulations[text("row_stream: articulation", articulation)].prefix]
         wanted = RowFilter(keys, kinds, components, entities=articulation is None)
         self._publishers.check_open()
         source: RowSource | DerivedRowSource = self._publishers.rows(wanted)
@@ -726,8 +729,14 @@ class URLabClient(ClientState):
         await self.close()
 
     def __repr__(self) -> str:
+        if self._closed or self._state.hello is None:
+            return f"<{self._title()}>"
+        robots = ", ".join(self.articulations) or "no robots"
+        return f"<{self._title()}, {self.step_mode} at {self.sim_time:.3f} s: {robots}>"
+
+    def _title(self) -> str:
         state = "closed" if self._closed else "connected" if self.connected else "not connected"
-        return f"<URLabClient {self.address} {state}>"
+        return f"URLabClient {self.address} {state}"
 
     def _repr_html_(self) -> str:
         play = step_mode = passed = ""
@@ -745,7 +754,7 @@ class URLabClient(ClientState):
             "robots": ", ".join(self.articulations),
             "other bodies": ", ".join(name for name in self.entities if name not in self.articulations),
         }
-        return fields(repr(self)[1:-1], found)
+        return fields(self._title(), found)
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(

@@ -59,6 +59,8 @@ async def _examine(config: ClientConfig, session: Session, state: SimState, stat
     loop = running_loop()
     async for finding in _reachability(config, session, state_port):
         yield finding
+        if finding.verdict is Verdict.PROBLEM:
+            return  # whoever accepts no connection answers nothing
     before = loop.time()
     try:
         ops = (await session.call(Meta())).ops
@@ -137,7 +139,8 @@ async def _reachability(config: ClientConfig, session: Session, state_port: int)
             yield Finding(Verdict.OK, what, f"{host}:{port} accepts connections.")
         else:
             need = Verdict.PROBLEM if what == "RPC" else Verdict.NOTE
-            yield Finding(need, what, f"{host}:{port}: {problem}")
+            start = " Start play in the editor, or run `urlab serve`." if what == "RPC" else ""
+            yield Finding(need, what, f"{host}:{port}: {problem}{start}")
 
 
 async def connection_problem(host: str, port: int, within: float = _CONNECT_S) -> str | None:
@@ -177,6 +180,7 @@ def _versions(session: Session, state: SimState) -> Finding:
 
 
 async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
+    steps = state.clocks.step_count
     try:
         first = await session.call(PieStatus())
         second = await watched(lambda: session.call(PieStatus()), first)
@@ -194,9 +198,10 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
         return Finding(Verdict.PROBLEM, "play", f"Play is {second.state}. {advice}".strip()), False
     runs = second.sim_time != first.sim_time
     if state.mode.live and not runs:
-        text = f"Physics stands still at {second.sim_time or 0:g} s: it is paused. Call runtime.set_paused(False)."
+        text = f"Physics stands still at {second.sim_time or 0:g} s: it is paused. "
+        text += "Call runtime.set_paused(False), or start `urlab serve` with --unpaused."
         return Finding(Verdict.PROBLEM, "play", text), True
-    if not state.mode.live and runs:
+    if not state.mode.live and runs and state.clocks.step_count == steps:  # otherwise this client steps meanwhile
         text = f"Time passes without steps although this client expects mode {state.mode.current}: "
         return Finding(Verdict.PROBLEM, "play", text + _CHANGED), True
     how = "running" if runs else "waiting for step()"
@@ -204,6 +209,10 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
 
 
 def _physics(session: Session, state: SimState) -> Iterator[Finding]:
+    if state.clocks.set_back:
+        text = f"Its time went back {state.clocks.set_back} times while this client stepped it. "
+        text += "Unless another client did that, it has diverged: try a shorter timestep, or weaker gains."
+        yield Finding(Verdict.PROBLEM, "physics", text)
     if state.mirror.model is not None:
         import mujoco
 
@@ -259,7 +268,7 @@ def _articulations(state: SimState) -> Iterator[Finding]:
         if not np.any(record.ctrl):
             text = "All set-points are 0. Set them with set_ctrl() or ctrl_array before step()."
             yield Finding(Verdict.NOTE, key, text)
-        elif not controlled and state.clocks.step_count and not np.any(record.applied):
+        elif not (controlled or state.clocks.set_back) and state.clocks.step_count and not np.any(record.applied):
             text = "Set-points are sent but not applied. Is the control source `ui`? "
             yield Finding(Verdict.PROBLEM, key, text + "Call runtime.set_control_source('zmq').")
         else:

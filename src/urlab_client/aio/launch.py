@@ -48,6 +48,7 @@ SHARED_MEMORY: Final = "/dev/shm"  # noqa: S108 - a server creates its own direc
 _START_S = 60.0
 _START_TIMEOUT = "start-timeout"
 _CHUNK_BYTES = 65536
+_WARNS = "urlab serve: warning: "
 _LOOK_S = 0.01
 _OPENING = frozenset({"allow-any-client", "allow-client", "insecure-no-auth", "server-key"})
 _STOP_S = 10.0  # it takes 0.2 s on an idle machine, and 3 s with eight programs per processor
@@ -373,7 +374,7 @@ def _log_lines(pipe: IO[bytes], errors: list[str], logs: threading.Event) -> Non
         while line := pipe.readline(_CHUNK_BYTES):
             text = line.decode(errors="replace")
             if logs.is_set():
-                log.info("server: %s", text.rstrip())
+                log.log(logging.WARNING if text.startswith(_WARNS) else logging.INFO, "server: %s", text.rstrip())
             else:
                 errors.append(text)
 

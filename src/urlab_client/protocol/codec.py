@@ -124,12 +124,22 @@ def encode_request(request: Request[Any], session_id: str, *, json: bool = False
     try:
         frame = _json_ascii(request) if json else _encoder.encode(request)
     except TypeError as error:
-        raise TypeError(f"{op_of(request).name}: {error}") from None
+        raise TypeError(f"{op_of(request).name}: {_unsendable(request)}: {error}") from None
     if len(frame) > MAX_REQUEST_BYTES:
         raise ValueError(
             f"{op_of(request).name}: a request of {len(frame)} bytes exceeds the limit {MAX_REQUEST_BYTES}"
         )
     return frame
+
+
+def _unsendable(request: Request[Any]) -> str:
+    """Return the name of the first field that cannot be encoded."""
+    for name in request.__struct_fields__:
+        try:
+            _encoder.encode(getattr(request, name))
+        except TypeError:
+            return name
+    return "request"
 
 
 def _json_ascii(request: Request[Any]) -> bytes:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import StrEnum
 from functools import lru_cache
 
 from msgspec import Struct
 
+from urlab_client.enums import Word
 from urlab_client.errors import ProtocolError
 from urlab_client.values.layouts import BytesLike
 
 
-class TopicKind(StrEnum):
+class TopicKind(Word):
     """What a topic carries; the value is the topic's fixed part."""
 
     JOINT = "joint"

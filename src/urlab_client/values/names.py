@@ -10,7 +10,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, overload
 
 T = TypeVar("T")
 D = TypeVar("D")
@@ -139,6 +139,9 @@ class Local(PublicDir):
         self._state = state
 
 
+_NESTED = {"articulation", "entity"}  # their descriptions are tables of tables
+
+
 class NameMap(PublicDir, dict[str, T]):
     """A read-only dict of named things that also finds an entry by an alias, where the alias means one entry only.
 
@@ -206,9 +209,11 @@ class NameMap(PublicDir, dict[str, T]):
 
     def _key(self, name: object) -> str | None:
         """Return the key that `name` or its alias means, None when there is none or more than one."""
+        if not isinstance(name, str):
+            return None
         if super().__contains__(name):
-            return cast("str", name)
-        match self._aliases.get(cast("str", name)):
+            return name
+        match self._aliases.get(name):
             case (key,):
                 return key
             case _:
@@ -231,10 +236,18 @@ class NameMap(PublicDir, dict[str, T]):
         found = self._key(key)
         return default if found is None else super().__getitem__(found)
 
+    def shortest(self) -> list[str]:
+        """Return what each key is called for short: the shortest alias that means no other, or itself."""
+        short = {key: key for key in self}
+        for alias, keys in self._aliases.items():
+            if len(keys) == 1 and len(alias) < len(short[keys[0]]):
+                short[keys[0]] = alias
+        return [*short.values()]
+
     def _unknown(self, name: object) -> UnknownName:
         known = tuple(self)
-        matches = self._aliases.get(cast("str", name), ())
         spelled = name if isinstance(name, str) else ""
+        matches = self._aliases.get(spelled, ())
         suggestions = difflib.get_close_matches(spelled, known) or difflib.get_close_matches(
             spelled, self.with_aliases()
         )
@@ -248,9 +261,14 @@ class NameMap(PublicDir, dict[str, T]):
         return [*self.with_aliases()]
 
     def _repr_html_(self) -> str:
-        from urlab_client.values.html import fields  # NumPy, which the command line loads late
+        from urlab_client.values.html import fields, table  # NumPy, which the command line loads late
 
-        return fields(self.kind, {name: repr(one) for name, one in self.items()})
+        ways = [getattr(one, "describe", None) for one in self.values()]
+        if self.kind in _NESTED or None in ways:
+            return fields(self.kind, {name: repr(one) for name, one in self.items()})
+        rows: list[dict[str, Any]] = [describe().to_dict() for describe in ways if describe is not None]
+        heads = [*dict.fromkeys(head for row in rows for head in row)]
+        return table([[row.get(head) for head in heads] for row in rows], heads=heads, caption=f"{self.kind}s")
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
         raise TypeError(f"this map of {self.kind} names is read-only; dict(map) makes a copy to change")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
@@ -36,7 +36,9 @@ from urlab_client.values.descriptions import (
     SensorDescription,
     SetPointMeaning,
 )
+from urlab_client.values.html import fields
 from urlab_client.values.names import NameMap, PublicDir, own_aliases
+from urlab_client.values.plain import Serializable
 
 if TYPE_CHECKING:
     import mujoco
@@ -44,8 +46,21 @@ if TYPE_CHECKING:
 _UNSPECIFIC = {"motor", "general"}  # what servers report for a `<general>`
 
 
+class _Described(Protocol):
+    def describe(self) -> Serializable: ...
+
+
+class _Element(PublicDir):
+    """An element that a notebook shows as its description."""
+
+    __slots__ = ()
+
+    def _repr_html_(self: _Described) -> str:
+        return fields(repr(self)[1:-1], self.describe().to_dict())
+
+
 @dataclass(slots=True, eq=False, repr=False, kw_only=True)
-class Actuator(PublicDir):
+class Actuator(_Element):
     """One actuator of an articulation.
 
     Attributes:
@@ -172,11 +187,11 @@ class Actuator(PublicDir):
         )
 
     def __repr__(self) -> str:
-        return f"<Actuator {self.name!r} id={self.id}>"
+        return f"<Actuator {self.name!r}{f' {self.type}' if self.type else ''} id={self.id}>"
 
 
 @dataclass(slots=True, eq=False, repr=False, kw_only=True)
-class Joint(PublicDir):
+class Joint(_Element):
     """One joint of an articulation.
 
     Attributes:
@@ -247,7 +262,7 @@ class Joint(PublicDir):
         )
 
     def __repr__(self) -> str:
-        return f"<Joint {self.name!r} id={self.id}>"
+        return f"<Joint {self.name!r} {self.kind} id={self.id}>"
 
 
 class ScalarJoint(Joint):
@@ -270,7 +285,7 @@ class ScalarJoint(Joint):
 
 
 @dataclass(slots=True, eq=False, repr=False, kw_only=True)
-class Sensor(PublicDir):
+class Sensor(_Element):
     """One sensor of an articulation.
 
     Attributes:
@@ -314,7 +329,7 @@ class Sensor(PublicDir):
         )
 
     def __repr__(self) -> str:
-        return f"<Sensor {self.name!r} id={self.id} dim={self.dim}>"
+        return f"<Sensor {self.name!r}{f' {self.kind}' if self.kind else ''} id={self.id} dim={self.dim}>"
 
 
 @dataclass(slots=True, eq=False, repr=False, kw_only=True)

@@ -30,7 +30,7 @@ from typing import cast
 import msgspec
 import numpy as np
 
-from urlab_client.aio.arguments import finite, is_array, mapping, require
+from urlab_client.aio.arguments import finite, is_array, mapping, require, text
 from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.layout import compiled_ids
@@ -128,6 +128,7 @@ class RuntimeNamespace(RuntimeOps):
     def _positions(self, target: str, qpos: Vector, *, by_name: bool) -> Floats:
         if not is_array(qpos):
             raise TypeError(f"set_qpos takes numbers, got {qpos!r:.80}.")
+        text("set_qpos: target", target)
         values = tuple(qpos)
         arts = self._state.objects.articulations if by_name else self._state.objects.articulations_by_id
         joints = {j.qpos_local_offset: name for name, j in arts[target].joints.items()} if target in arts else {}

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+
 from urlab_client.aio.model.articulation_state import SentWrenches, restore_wrenches
 from urlab_client.errors import StepTimeout
 from urlab_client.protocol.messages.session import Clock, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
+
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 # By the server's clock. A larger difference means that the clock was set, not that messages were reordered.
 _OVERTAKEN_S = 1.0
@@ -18,6 +22,7 @@ class Clocks:
 
     Attributes:
         step_count: Steps since the last handshake or reset.
+        set_back: How often a step has set the simulation time back since then.
     """
 
     def __init__(self) -> None:
@@ -26,6 +31,15 @@ class Clocks:
         self.sim_clock: Clock = _ZERO
         self.wall_clock: Clock = _ZERO
         self.recv_wall_time_ns: int = 0
+        self.set_back: int = 0
+
+    def note_set_back(self, before: float) -> None:
+        """Note that a step has set the time back, which MuJoCo does to a simulation that diverges."""
+        self.set_back += 1
+        if self.set_back & (self.set_back - 1) == 0:  # what is unstable is so at every step
+            times = f" ({self.set_back} times so far)" if self.set_back > 1 else ""
+            text = "simulation time went from %g s to %g s in a step: it diverged, unless another client reset it%s"
+            log.warning(text, before, self.sim_time, times)
 
     def absorb(self, state: StateReply | StateSnapshot, received_ns: int) -> None:
         """Take counter and clocks from a state that was received at that time."""
@@ -48,6 +62,7 @@ class Clocks:
         self.step_count = 0
         self.sim_time = 0.0
         self.sim_clock = _ZERO
+        self.set_back = 0
 
 
 class PendingOutcomes:

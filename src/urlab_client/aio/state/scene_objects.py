@@ -139,7 +139,7 @@ class SceneObjects:
 
     def require_camera(self, name: str) -> URLabCameraView:
         """Return the camera named `<articulation>/<camera>` or just `<camera>`. Raises `UnknownName`."""
-        if name in self.global_cameras:
+        if text("camera: name", name) in self.global_cameras:
             return self.global_cameras[name]
         owner, _, short = self.camera_name(name).rpartition("/")
         return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]

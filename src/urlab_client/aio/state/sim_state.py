@@ -198,6 +198,7 @@ class SimState:
             for record in self.objects.entity_records.values():
                 record.pose = None
             self._write(reply, parts, received, into_mirror=True)
+        self.clocks.set_back = 0
         self._publish(reply)
 
     @property

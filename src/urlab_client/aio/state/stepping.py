@@ -18,7 +18,7 @@ from urlab_client.enums import CameraTiming, StepMode
 from urlab_client.errors import StepTimeout, UnknownKeyframe, URLabError
 from urlab_client.protocol.codec import check_finite, op_of
 from urlab_client.protocol.messages.session import ArticulationCommand, Reset, ResetOk, Step, StepOk
-from urlab_client.values.names import UnknownName
+from urlab_client.values.names import UnknownName, unknown_name
 
 Cameras = bool | Mapping[str, "str | CameraTiming"]
 
@@ -39,6 +39,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     if pictures is not None:
         pictures.ask(request)
     assumed, before, sent_in = modes.assumed, state.clocks.step_count, session.session_id
+    began = state.clocks.sim_time
     level = asked or levels.of_session
     request.observations = None if level == levels.in_force else level
     levels.forget()  # until the reply arrives
@@ -52,8 +53,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     except BaseException as error:
         _note_failure(state, turn, error, 1 if mode is StepMode.PUPPET else n_steps, wrenches)
         raise
-    if state.pending:
-        state.pending.clear()
+    _settle(state, reply, None if assumed or mode is not StepMode.DIRECT else began)
     if assumed:
         # If an abandoned handshake was answered meanwhile, the server's counter started anew.
         _learn_mode(state, request, reply, reply.step - (before if session.session_id == sent_in else 0))
@@ -75,6 +75,14 @@ async def send_step(state: SimState, turn: Turn, request: Step) -> StepOk:
     if request.n_steps < 1 and state.mode.current is StepMode.DIRECT:
         raise ValueError(_too_few(request.n_steps, state.mode.current))  # the server would take one
     return await turn.call(request)
+
+
+def _settle(state: SimState, reply: StepOk, began: float | None) -> None:
+    """Note that nothing is pending, and whether a step that began at this time, seconds, has set the time back."""
+    if state.pending:
+        state.pending.clear()
+    elif began is not None and reply.time < began and reply.replay is None:
+        state.clocks.note_set_back(began)
 
 
 def _note_failure(state: SimState, turn: Turn, error: BaseException, steps: int, wrenches: SentWrenches) -> None:
@@ -274,7 +282,9 @@ def _compiled_keyframe(state: SimState, name: str) -> str:
     model = state.mirror.model
     if model is None:
         return name
+    names = compiled_ids(model, "key", compiled_prefixes(state.objects.articulations))
     try:
-        return compiled_ids(model, "key", compiled_prefixes(state.objects.articulations)).key(name)
+        return names.key(name)
     except UnknownName as error:
-        raise UnknownKeyframe("unknown_keyframe", f"{error} Nothing was sent.", op="reset") from None
+        reason = error if error.matches else unknown_name("keyframe", name, names.shortest())
+        raise UnknownKeyframe("unknown_keyframe", f"{reason} Nothing was sent.", op="reset") from None

@@ -121,7 +121,7 @@ class Stream(LocalStream[T], Generic[T]):
         """
         kept = StreamBuffer(StreamPolicy(policy), buffer, buffer_bytes)
         if max_rate is not None and kept.policy is not StreamPolicy.LATEST:
-            raise ValueError(f"max_rate requires policy 'latest', which skips items; {kept.policy!r} keeps them")
+            raise ValueError(f"max_rate requires policy 'latest', which skips items; {kept.policy.value!r} keeps them")
         if max_rate is not None:
             require("max_rate", max_rate, SupportsFloat, "a number above 0")
             if not 0 < float(max_rate) < math.inf:

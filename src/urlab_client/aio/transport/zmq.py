@@ -46,6 +46,7 @@ _RCVMORE = int(zmq.RCVMORE)
 _POLLIN = int(zmq.POLLIN)
 
 _MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+_NOTICEABLE_S = 1e-3
 # Waking up adds at most a tenth to replies that take longer.
 _SPIN_S = 150e-6
 _LONGEST_SPIN_S = 500e-6
@@ -264,10 +265,11 @@ class ZmqTransport:
         def give_up() -> None:
             self._read_events()  # as in `_expire`
             if not waiter.done():
+                waited = loop.time() - started
+                within = f" within {_ms(waited)}" if waited > _NOTICEABLE_S else ""
                 waiter.set_exception(
                     ServerUnreachable(
-                        f"{op.name}: no connection to {self.endpoint} within "
-                        f"{_ms(loop.time() - started)}: {self._obstacle}. Nothing was sent.",
+                        f"{op.name}: no connection to {self.endpoint}{within}: {self._obstacle}. Nothing was sent.",
                         op=op.name,
                         hint="Is the editor (with URLab's bridge) or `urlab serve` running there, on this port?",
                     )

@@ -71,6 +71,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
     seed determines only this noise and what the task and `randomise` draw. Physics is deterministic: the same seed and
     actions give the same observations, bit for bit, on the same build of MuJoCo.
 
+    If the simulation diverges, so that MuJoCo resets it, the episode is truncated with reward 0, and `info["error"]`
+    has an exception.
+
     With `render_mode="rgb_array"`, `render` returns the frame of `render_camera`. Each step draws this frame, which
     takes time. Images never affect the physics.
 

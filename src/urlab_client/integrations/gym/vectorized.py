@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +15,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from urlab_client.aio.arguments import integer
-from urlab_client.errors import refused_for_good
+from urlab_client.errors import URLabError, refused_for_good
 from urlab_client.integrations._feed.messages import Transition
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode
@@ -32,6 +33,8 @@ from urlab_client.integrations.gym.task import (
     with_task,
 )
 from urlab_client.randomise.declaration import Randomisation
+
+log: logging.Logger = logging.getLogger("urlab_client.gym")
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -128,6 +131,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._begun = np.zeros(num_envs, dtype=bool)
         self._ended = np.ones(num_envs, dtype=bool)
         self._started = False
+        self._n_diverged = 0
         self._keyframe: str | None = None
         self._success: Bools | None = None
         self._all = np.arange(num_envs)
@@ -220,7 +224,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             fresh, acting = np.flatnonzero(self._ended), np.flatnonzero(~self._ended)
         before = None if self.reward_fn is None else mapped(np.copy, self._observations)
         self.elapsed += 1
+        began = self._state()[2].copy()
         errors = self._move(fresh, self._keyframe, acting, flat)
+        errors = {**errors, **self._diverged(acting, began, errors)}
         infos = self._infos(errors)
         rewards, terminated = self._judged(before, actions, errors, infos)
         if idle := [*fresh.tolist(), *errors]:
@@ -240,6 +246,24 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if over and self.autoreset_mode is AutoresetMode.SAME_STEP:
             infos = self._same_step_reset(errors, infos)
         return self._shown(), rewards, terminated, truncated, infos
+
+    def _diverged(self, acting: Indices, began: Floats, errors: Mapping[int, Exception]) -> dict[int, Exception]:
+        """Return an error for each environment whose simulation was reset, or lost its numbers, during its action."""
+        qpos, _, now = self._state()
+        found: dict[int, Exception] = {}
+        for i in acting[(now[acting] <= began[acting]) | ~np.isfinite(qpos[acting].sum(axis=1))].tolist():
+            if i not in errors:
+                what = f"Simulation time went from {began[i]:.3f} s to {now[i]:.3f} s"
+                what = what if now[i] <= began[i] else "Joint positions stopped being finite"
+                hint = "MuJoCo resets a simulation that diverges. Try a shorter timestep, or weaker gains."
+                found[i] = URLabError(f"{what} during an action.", hint=hint)
+        self._ended[[*found]] = True  # so that no task is told, as of other failures
+        total = self._n_diverged + len(found)
+        if total.bit_length() > self._n_diverged.bit_length():  # what is unstable is so in every episode
+            last = [*found.values()][-1]
+            log.warning("episodes that ended because their simulations diverged: %d; the last: %s", total, last)
+        self._n_diverged = total
+        return found
 
     def _note(self, indices: Indices, errors: Mapping[int, Exception], *told: NDArray[Any]) -> None:
         """Tell who records environments, if they did not fail, what led to their states; see `_transition`.

@@ -10,7 +10,8 @@ from msgspec import Struct, field
 
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.base import ControlRequest, Effect, Floats, Int32, Needs, Op, QuatWXYZ, Reply, Request, doc
-from urlab_client.values.pictures import decode_camera, thumbnail
+from urlab_client.values import html
+from urlab_client.values.pictures import Pixels, decode_camera, shown_png, thumbnail
 from urlab_client.values.plain import Serializable
 from urlab_client.values.rotation import Vec3
 
@@ -108,13 +109,16 @@ class CameraFrame(Serializable, Struct, kw_only=True, omit_defaults=True):
     dtype: Annotated[str, doc("`bgra8`, or `float32` for depth in centimetres.")]
     data: Annotated[bytes, doc("width * height * 4 bytes.")]
 
-    def _shown(self) -> dict[str, Any]:
-        return super()._shown() | {"data": _thumbnail(self, "picture")}
+    def _repr_png_(self) -> bytes | None:
+        return shown_png(*_pixels(self))
+
+    def _repr_html_(self) -> None:  # the picture itself says more than a table
+        return None
 
 
-def _thumbnail(frame: CameraFrame, name: str) -> str:
+def _pixels(frame: CameraFrame) -> tuple[Pixels, CameraMode]:
     mode = CameraMode.DEPTH if frame.dtype == "float32" else CameraMode.REAL
-    return thumbnail(decode_camera(frame.data, mode, frame.width, frame.height).pixels, mode, name)
+    return decode_camera(frame.data, mode, frame.width, frame.height).pixels, mode
 
 
 class Perturbation(Serializable, Struct, kw_only=True):
@@ -156,6 +160,9 @@ class ReplayProgress(Serializable, Struct, kw_only=True):
     total_frames: Annotated[int, doc("Number of frames of the session.")]
 
 
+_UPRIGHT: Final = 3
+
+
 class StepOk(StateReply, tag="step_ok", kw_only=True):
     """State after the step."""
 
@@ -177,8 +184,12 @@ class StepOk(StateReply, tag="step_ok", kw_only=True):
             self.entities = self.scene
 
     def _shown(self) -> dict[str, Any]:
-        pictures = {name: _thumbnail(frame, name) for name, frame in (self.cameras or {}).items()}
-        return super()._shown() | {"cameras": pictures}
+        shown = super()._shown()
+        pictures = {name: thumbnail(*_pixels(frame), name) for name, frame in (self.cameras or {}).items()}
+        robots: dict[str, dict[str, Any]] = shown["per_articulation"]
+        if len(robots) <= _UPRIGHT:  # a row for each robot would be wide
+            shown["per_articulation"] = {name: html.fields("", robot) for name, robot in robots.items()}
+        return shown | {"time": f"{self.time:.3f} s", "sim_time": None, "wall_time": None, "cameras": pictures}
 
 
 class ArticulationCommand(Serializable, Struct, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Struct
 
-from urlab_client.enums import CameraMode
+from urlab_client.enums import CameraMode, Word
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol.base import doc
 from urlab_client.protocol.codec import encode_message, from_wire_array
@@ -20,7 +19,7 @@ from urlab_client.values.pictures import JPEG_QUALITY, Pixels, jpeg, png, shown_
 from urlab_client.values.plain import Serializable
 
 
-class StreamPolicy(StrEnum):
+class StreamPolicy(Word):
     """Which messages a stream keeps for a busy reader."""
 
     LATEST = "latest"

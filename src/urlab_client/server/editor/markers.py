@@ -78,20 +78,26 @@ def box(center: Vec3, half_extents: Vec3, rotation: Quat, color: Vec3) -> Primit
 
 
 def arrow(start: Vec3, end: Vec3, color: Vec3, head: float, thickness: float = 1.0) -> Primitive:
-    """Return an arrow: its shaft, and the four edges of its head, which has this length, metres."""
+    """Return an arrow: its shaft, and the four edges of its head, which has this length, metres.
+
+    What is too long or too large for numbers has no head.
+    """
     tail: NDArray[np.float64] = np.array(start)
     tip: NDArray[np.float64] = np.array(end)
-    length = float(np.linalg.norm(tip - tail))
+    length = math.dist(start, end)
     shaft = line(start, end, color, thickness)
-    if length == 0.0:
+    if not 0.0 < length < math.inf:
         return shaft
     along = (tip - tail) / length
     least: NDArray[np.float64] = np.eye(3)[np.argmin(np.abs(along))]
     side: NDArray[np.float64] = np.cross(along, least)
     side /= float(np.linalg.norm(side))
     other: NDArray[np.float64] = np.cross(along, side)
-    barbs = [tip - head * (along - _HEAD_SPREAD * out) for out in (side, -side, other, -other)]
-    edges = [line(end, (x, y, z), color, thickness) for x, y, z in np.array(barbs).tolist()]
+    with np.errstate(over="ignore"):
+        barbs = np.array([tip - head * (along - _HEAD_SPREAD * out) for out in (side, -side, other, -other)])
+    if not np.isfinite(barbs).all():
+        return shaft
+    edges = [line(end, (x, y, z), color, thickness) for x, y, z in barbs.tolist()]
     return (*shaft, *itertools.chain.from_iterable(edges))
 
 
