@@ -133,13 +133,19 @@ class Page:
         return f"Math.abs(parseFloat({shown}.replace('\u2212', '-')) - {value}) < 0.03"
 
     def curve(self, key: str, signal: str) -> list[float]:
-        """Return what the pointer reads of a signal along the curves with a key, from left to right."""
+        """Return what the pointer reads of a signal along the curves with a key, from left to right, over 30 s.
+
+        That is long enough for a slow machine, whose simulation goes on while a test asks its page.
+        """
+        self.choose("#span", "30")
+        # Curves out of sight are not drawn: the page sees that they are in sight just before `seen` does.
         read: list[str] = self.driver.execute_async_script(
             "const [key, signal, done] = arguments; const one = document.querySelector(`[data-sensor='${key}']`);"
             "one.scrollIntoView({block: 'center'}); const box = one.querySelector('canvas').getBoundingClientRect();"
             "const shown = [...one.querySelectorAll('.signal')].find(one => one.children[1].textContent === signal);"
             "const painted = () => new Promise(go => requestAnimationFrame(() => requestAnimationFrame(go)));"
-            "(async () => { const read = []; for (let share = 0; share < 1; share += 0.05) {"
+            "const seen = new Promise(go => new IntersectionObserver(go).observe(one.querySelector('canvas')));"
+            "(async () => { await seen; const read = []; for (let share = 0; share < 1; share += 0.025) {"
             "one.querySelector('canvas').dispatchEvent(new PointerEvent('pointermove',"
             "{clientX: box.left + 48 + share * (box.width - 56), clientY: box.top + 20}));"
             "await painted(); read.push(shown.querySelector('.num').textContent); }"
