@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import anyio
 import msgspec
 from msgspec import Struct, structs
 
+from urlab_client.aio.model.elements import ScalarJoint
 from urlab_client.console.description import home_of
 from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.messages import encode
@@ -212,15 +214,36 @@ class Controls:
             self._driven[key] = self._client.session_id
             self._pending.add(key)
             if noted and given:
-                self._note_driving(viewer, key, *given)
+                self._note_once(viewer, "set-points", key, *given)
         self._commanded.set()
 
-    def _note_driving(self, viewer: Viewer, key: str, *names: str) -> None:
-        now, what = time.monotonic(), (viewer.key, key, *names)
+    def _note_once(self, viewer: Viewer, what: str, key: str, *names: str) -> None:
+        now, burst = time.monotonic(), (viewer.key, what, key, *names)
         self._driving = {known: at for known, at in self._driving.items() if now - at < _BURST_S}
-        if what not in self._driving:
-            self._view.note("call", viewer.name, "set-points", encode({key: names}).decode())
-        self._driving[what] = now
+        if burst not in self._driving:
+            self._view.note("call", viewer.name, what, encode({key: names}).decode())
+        self._driving[burst] = now
+
+    async def pose(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
+        """Place joints of one coordinate in puppet mode, by articulation and joint, or none if one cannot be."""
+        if self._client.step_mode is not StepMode.PUPPET:
+            raise ValueError(f"posing needs puppet mode, not {self._client.step_mode}: elsewhere physics moves the joints")
+        if (data := self._client.data) is None:
+            raise ValueError("posing needs a local model, and none could be compiled")
+        robots = self._client.articulations
+        joints = [(robots[key].joints[name], value) for key, given in values.items() for name, value in given.items()]
+        for joint, value in joints:
+            if not isinstance(joint, ScalarJoint):
+                raise ValueError(f"{joint.name} is a {joint.kind} joint: only hinge and slide joints take one number")
+            low, high = joint.limits or (-math.inf, math.inf)
+            if not low <= value <= high:
+                raise ValueError(f"{joint.name} goes from {low:g} to {high:g} {joint.unit}: {value:g} is out of reach")
+        self._lease.use(viewer)
+        for joint, value in joints:
+            data.qpos[joint.qpos_offset] = value
+        for key, given in values.items():
+            self._note_once(viewer, "pose", key, *given)
+        await self._client.step(0)
 
     async def hold(self, viewer: Viewer, name: str, holding: bool) -> None:
         """Make a robot with torque motors hold its home pose, or let it go.

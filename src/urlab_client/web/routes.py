@@ -223,6 +223,12 @@ async def hold(call: Call, body: dict[str, bool]) -> None:
         await controls.run(call.viewer, True)
 
 
+@endpoint("POST", "/api/pose")
+async def pose(call: Call, body: dict[str, dict[str, float]]) -> None:
+    """Place joints in puppet mode: `{articulation: {joint: radians or metres}}`. Requires the controls."""
+    await call.console.controls.pose(call.viewer, body)
+
+
 # Bodies
 
 

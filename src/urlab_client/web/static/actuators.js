@@ -3,8 +3,8 @@
 import { h, number, text, toast } from "./dom.js";
 import { setPoint } from "./link.js";
 
-const HELD_MS = 700;
-const UNKNOWN = { position: [-Math.PI, Math.PI], velocity: [-5, 5], force: [-10, 10], "": [-1, 1] };
+export const HELD_MS = 700;
+export const UNKNOWN = { position: [-Math.PI, Math.PI], velocity: [-5, 5], force: [-10, 10], "": [-1, 1] };
 const MEANINGS = { position: "Position", velocity: "Velocity", force: "Force or torque", "": "Control" };
 const FORCES = { "N m": "Torque", N: "Force" };
 
@@ -137,11 +137,11 @@ export function fallen(art, state) {
 /** What holds a robot, or the reason why it does not move, as far as its state shows it; or an empty string. */
 export function stillness(art, state, status) {
   if (status?.replay) return "";
-  if (status?.mode === "puppet") return "In mode puppet a program places it, and no physics runs.";
+  if (status?.mode === "puppet") return "In mode puppet no physics runs. Place its joints below, or push it in the view.";
   if (status?.holding.includes(art.key) && fallen(art, state)) return "It holds its home pose, but has fallen. Press Reset to.";
   if (status?.holding.includes(art.key)) return `It holds its home pose ${status.moving ? "until you move a slider" : "as soon as physics runs"}.`;
   if (!art.actuators.length) return "It has no actuators: only gravity and contacts move it.";
-  if (status?.source === "ui") return "The editor's panel drives it (control “ui”): set-points from here have no effect.";
+  if (status?.source === "ui") return "The editor's panel drives it. To use the set-points from here, choose those of “programs” in the bar.";
   const limits = Object.values(art.controller?.params.torque_limit ?? {});
   if (limits.length && limits.every((limit) => limit === 0)) return "Its torque limits are 0, so nothing drives it. Raise them under “Gains”.";
   const forces = art.actuators.filter((actuator) => actuator.takes === "force");

@@ -93,9 +93,9 @@ export function makeBar() {
   ui.reset = h("button", { id: "reset", title: "Reset to the start or a keyframe (r)", onclick: () => reset(ui.keyframe.value) }, "Reset to");
   ui.mode = h("select", { id: "mode", "aria-label": "Step mode", onchange: () => choose(ui.mode.value) },
     ...["live", "direct", "puppet"].map((mode) => h("option", {}, mode)));
-  ui.source = h("select", { id: "source", "aria-label": "Control source", title: "Which set-points drive: this client's (zmq) or the editor panel's (ui)",
+  ui.source = h("select", { id: "source", "aria-label": "Whose set-points drive", title: "Whose set-points drive the robots: those of programs and this console, or those of the editor's panel",
     onchange: () => ui.source.value && op("set_control_source", { source: ui.source.value }) },
-    h("option", { value: "", hidden: true }, "–"), h("option", { value: "zmq" }, "zmq"), h("option", { value: "ui" }, "ui"));
+    h("option", { value: "", hidden: true }, "–"), h("option", { value: "zmq" }, "programs"), h("option", { value: "ui" }, "editor panel"));
   ui.speed = h("input", { id: "speed", type: "range", min: 5, max: 100, step: 5, value: 100, "aria-label": "Speed, percent of real time",
     onchange: () => op("set_sim_speed", { percent: +ui.speed.value }), oninput: () => text(ui.speedText, `${ui.speed.value} %`) });
   ui.speedText = h("span", { class: "num" }, "100 %");
@@ -111,7 +111,7 @@ export function makeBar() {
     h("span", { class: "group" }, ui.step, ui.steps),
     h("span", { class: "group" }, ui.reset, ui.keyframe),
     h("label", {}, "mode ", ui.mode),
-    h("label", {}, "control ", ui.source),
+    h("label", {}, "set-points of ", ui.source),
     h("label", { class: "speed" }, "speed ", ui.speed, ui.speedText),
     ui.restart);
 

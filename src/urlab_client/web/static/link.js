@@ -129,6 +129,23 @@ export const op = (name, body = {}, options) => ask("POST", `api/ops/${name}`, b
 const pending = new Map();
 let scheduled = false;
 
+/** Make a function that sends its newest argument, one request at a time; a refusal, null, drops what waits. */
+export function newest(send) {
+  let sending = false;
+  let waits = null;
+  return async (value) => {
+    waits = { value };
+    if (sending) return;
+    sending = true;
+    while (waits) {
+      const { value } = waits;
+      waits = null;
+      if ((await send(value)) === null) waits = null;
+    }
+    sending = false;
+  };
+}
+
 /** Set a set-point; the newest of each is sent with the next animation frame. */
 export function setPoint(articulation, actuator, value) {
   if (!pending.has(articulation)) pending.set(articulation, {});

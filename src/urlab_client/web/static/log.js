@@ -27,6 +27,8 @@ const TROUBLES = {
   "set-points": "Set-points did not reach the server.",
 };
 
+const each = (given, did, what) => Object.entries(given).map(([robot, names]) => `${did} ${names.length > 3 ? `${names.length} ${what}` : names.join(", ")} of ${robot}`).join("; ");
+
 /** What viewers do most, in words; `given` are the arguments. */
 const CALLS = {
   set_paused: (given) => (given.paused ? "paused physics" : "let physics run"),
@@ -35,7 +37,7 @@ const CALLS = {
   reset: (given) => `reset the simulation${given.keyframe_name ? ` to ${given.keyframe_name}` : ""}`,
   set_mode: (given) => `chose step mode ${given.mode}`,
   set_sim_speed: (given) => `set the speed to ${shortly(given.percent)} %`,
-  set_control_source: (given) => `gave control to ${given.source}`,
+  set_control_source: (given) => `made set-points of ${given.source === "ui" ? "the editor panel" : "programs"} drive`,
   begin_pie: () => "began play",
   stop_pie: () => "ended play",
   set_twist: (given) => `commanded ${given.articulation} to move`,
@@ -48,7 +50,8 @@ const CALLS = {
   "release the controls": () => "released the controls",
   "hold pose": (given) => `made ${given} hold its home pose`,
   "let go": (given) => `let ${given} go`,
-  "set-points": (given) => Object.entries(given).map(([robot, names]) => `set ${names.length > 3 ? `${names.length} set-points` : names.join(", ")} of ${robot}`).join("; "),
+  "set-points": (given) => each(given, "set", "set-points"),
+  pose: (given) => each(given, "placed", "joints"),
   "drive hand": (given) => `moved the hand of ${given}`,
   record: (given) => `began recording ${given}`,
   "stop recording": (given) => `finished recording ${given}`,

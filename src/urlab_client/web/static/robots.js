@@ -1,9 +1,9 @@
 // Articulations: joint positions against their ranges, actuator sliders, gains, commanded twist.
 
-import { ActuatorRow, actuatorTable, canHold, fallen, groups, limp, share, stillness } from "./actuators.js";
+import { ActuatorRow, HELD_MS, UNKNOWN, actuatorTable, canHold, fallen, groups, limp, share, stillness } from "./actuators.js";
 import { now, reset } from "./bar.js";
 import { $, h, heading, number, text } from "./dom.js";
-import { ask, on, op } from "./link.js";
+import { ask, newest, on, op } from "./link.js";
 
 let robots = [];
 const GAINS = ["kp", "kv", "torque_limit"];
@@ -23,12 +23,14 @@ class Robot {
     this.still = h("div", { class: "line still over", hidden: !canHold(art) }, this.said, h("span", { class: "space" }), canHold(art) ? this.hold : null);
     const why = h("button", { class: "quiet why", title: "Check everything from the sockets to the set-points", onclick: () => explain(art.key) }, "Why does it not move?");
     this.tables = groups(art).map((group) => actuatorTable(group, group.actuators.map((actuator) => this.actuator(actuator, art))));
+    this.joints = fold("Joints", joints.some((joint) => !driven.has(joint.name)) && !art.actuators.length,
+      h("div", { class: "table joints" }, joints.map((joint) => this.joint(joint))));
+    this.posing = false;
     this.element = h("section", { class: "card robot", "data-robot": art.key, "aria-label": art.key },
       heading(art.key, h("span", { class: "tag" }, `${count(art.joints.length, "joint")} · ${count(art.actuators.length, "actuator")}`),
         h("span", { class: "space" }), why),
       this.still, ...this.tables,
-      fold("Joints", joints.some((joint) => !driven.has(joint.name)) && !art.actuators.length,
-        h("div", { class: "table joints" }, joints.map((joint) => this.joint(joint)))),
+      this.joints,
       art.controller && GAINS.some((gain) => gain in art.controller.params) ? fold("Gains", false, this.gains(art)) : null,
       art.joints.some((joint) => joint.kind === "free") ? fold("Commanded twist", false, this.twist()) : null);
     this.art = art;
@@ -47,13 +49,21 @@ class Robot {
     return row;
   }
 
+  /** A joint on its range; in mode puppet, a slider that places it. */
   joint(joint) {
     const range = joint.range;
+    const ends = range ?? (joint.unit === "m" ? UNKNOWN[""] : UNKNOWN.position);
+    const place = newest((value) => ask("POST", "api/pose", { [this.key]: { [joint.name]: value } }));
+    const slider = h("input", { type: "range", min: ends[0], max: ends[1], step: (ends[1] - ends[0]) / 1000, value: 0, hidden: true,
+      "data-place": joint.name, "aria-label": `Place ${joint.name}, ${joint.unit}`, oninput: () => { moved = performance.now(); place(+slider.value); } });
+    let moved = -Infinity;
     const bar = h("i", { class: "mark" });
     const shown = h("span", { class: "num", "data-joint": joint.name });
     this.rows.push((state) => {
       const value = state.qpos?.[joint.index];
       text(shown, `${number(value)} ${joint.unit}`);
+      slider.hidden = !this.posing;
+      if (value != null && performance.now() - moved > HELD_MS && !slider.matches(":active")) slider.value = value;
       if (!range || value == null) return;
       const at = share(value, range);
       bar.style.left = `${100 * at}%`;
@@ -61,7 +71,7 @@ class Robot {
     });
     return h("div", { class: "line", title: range ? `${range[0].toFixed(3)} … ${range[1].toFixed(3)} ${joint.unit}` : "no limits" },
       h("span", { class: "name" }, joint.name),
-      h("span", { class: range ? "track bar" : "track" }, range ? bar : h("small", {}, "no limits")), shown);
+      h("span", { class: range ? "track bar" : "track" }, slider, range ? bar : h("small", {}, "no limits")), shown);
   }
 
   gains(art) {
@@ -89,21 +99,12 @@ class Robot {
     const knob = h("i", {});
     const pad = h("div", { class: "pad", tabindex: 0, role: "application", "aria-label": "Twist: W A S D", title: "Drag to command forward speed and turn rate, or use W A S D while focused" }, knob);
     const shown = h("span", { class: "num" }, "0 m/s · 0 rad/s");
-    let waiting = false;
-    let next = null;
-    const push = async (vx, yaw) => {
+    const command = newest((body) => op("set_twist", body));
+    const push = (vx, yaw) => {
       knob.style.left = `${50 - 45 * yaw}%`;
       knob.style.top = `${50 - 45 * vx}%`;
       text(shown, `${vx.toFixed(2)} m/s · ${yaw.toFixed(2)} rad/s`);
-      next = { articulation: this.key, linear: [vx, 0, 0], angular: [0, 0, yaw] };
-      if (waiting) return;
-      waiting = true;
-      while (next) {
-        const body = next;
-        next = null;
-        if ((await op("set_twist", body)) === null) next = null;
-      }
-      waiting = false;
+      command({ articulation: this.key, linear: [vx, 0, 0], angular: [0, 0, yaw] });
     };
     const drag = (event) => {
       const box = pad.getBoundingClientRect();
@@ -127,8 +128,12 @@ class Robot {
   }
 
   draw(state) {
+    const puppet = now.status?.mode === "puppet";
+    const posing = puppet && !now.status.replay;
+    if (posing && !this.posing) this.joints.open = true;
+    this.posing = posing;
     for (const row of this.rows) row(state);
-    for (const table of this.tables) table.inert = now.status?.mode === "puppet"; // where set-points do nothing
+    for (const table of this.tables) table.inert = puppet; // where set-points do nothing
     const said = stillness(this.art, state, now.status);
     if (said) this.still.hidden = false;
     this.still.classList.toggle("over", !said);
@@ -150,7 +155,7 @@ const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 /** What a program calls, as what a viewer presses. */
 const PRESS = [
   [/Call runtime\.set_paused\(False\).*?--unpaused\./, "Press Play."],
-  [/Call runtime\.set_control_source\('zmq'\)\./, "Choose control “zmq” under More."],
+  [/Call runtime\.set_control_source\('zmq'\)\./, "Choose set-points of “programs” in the bar."],
   [/Set them with set_ctrl\(\) or ctrl_array before step\(\)\./, "Move a slider."],
   [/step\(\) has not been called since discover\(\)\. Nothing moves without it\./, "No step has been taken. Press Play."],
   [/Call sim\.start\(\)\./, "Press Begin play."],
