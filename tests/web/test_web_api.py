@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
+import hashlib
 import io
 import json
 import re
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -689,6 +692,35 @@ def test_the_viewer_is_behind_the_same_door(site: Starlette, http: TestClient) -
         assert http.get(path).status_code == 401
     with pytest.raises(WebSocketDisconnect), http.websocket_connect("ws://localhost/viewer/state"):
         pass
+
+
+class Inline(HTMLParser):
+    """The scripts and handlers inside a page."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.code: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.code += [value for name, value in attrs if name.startswith("on") and value]
+        if tag == "script" and not dict(attrs).get("src"):
+            self.code.append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.get_starttag_text() == "<script>" and self.cdata_elem == "script":
+            self.code[-1] += data
+
+
+def test_the_viewer_s_policy_admits_what_its_page_runs_and_nothing_else_inline(http: TestClient) -> None:
+    page = http.get("/viewer/")
+    inline = Inline(page.text).code
+    digests = {base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in inline}
+    policy = page.headers["content-security-policy"]
+    assert len(digests) > 1
+    assert set(re.findall(r"'sha256-([^']*)'", policy)) == digests
+    assert "script-src 'self' 'unsafe-eval' 'unsafe-hashes' 'sha256-" in policy
+    assert "'unsafe-inline'" not in policy.partition("script-src")[2].partition(";")[0]
 
 
 def test_the_viewer_s_files_are_sent_once(http: TestClient) -> None:

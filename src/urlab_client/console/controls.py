@@ -12,7 +12,6 @@ import anyio
 import msgspec
 from msgspec import Struct, structs
 
-from urlab_client.aio.model.elements import ScalarJoint
 from urlab_client.console.description import home_of
 from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.messages import encode
@@ -227,13 +226,15 @@ class Controls:
     async def pose(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
         """Place joints of one coordinate in puppet mode, by articulation and joint, or none if one cannot be."""
         if self._client.step_mode is not StepMode.PUPPET:
-            raise ValueError(f"posing needs puppet mode, not {self._client.step_mode}: elsewhere physics moves the joints")
+            raise ValueError(
+                f"posing needs puppet mode, not {self._client.step_mode}: elsewhere physics moves the joints"
+            )
         if (data := self._client.data) is None:
             raise ValueError("posing needs a local model, and none could be compiled")
         robots = self._client.articulations
         joints = [(robots[key].joints[name], value) for key, given in values.items() for name, value in given.items()]
         for joint, value in joints:
-            if not isinstance(joint, ScalarJoint):
+            if joint.kind not in ("hinge", "slide"):
                 raise ValueError(f"{joint.name} is a {joint.kind} joint: only hinge and slide joints take one number")
             low, high = joint.limits or (-math.inf, math.inf)
             if not low <= value <= high:

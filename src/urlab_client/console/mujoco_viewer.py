@@ -13,6 +13,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from functools import cache
+from html import unescape
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -45,6 +46,7 @@ TAKEN = 4001
 
 _SHIM = '<script src="../static/viewer_pointer.js"></script><script src="../static/mujoco_viewer.js"></script>'
 _INLINE = re.compile(r"<script>(.*?)</script>", re.DOTALL)
+_HANDLERS = re.compile(r"""\son[a-z]+="([^"]*)\"""")
 
 
 class Files(NamedTuple):
@@ -71,7 +73,8 @@ def files() -> Files | None:
     if not page.is_file():
         return None
     html = page.read_text("utf-8")
-    hashes = " ".join(f"'sha256-{_digest(script)}'" for script in _INLINE.findall(html))
+    inline = [*_INLINE.findall(html), *(unescape(handler) for handler in _HANDLERS.findall(html))]
+    hashes = " ".join(["'unsafe-hashes'", *(f"'sha256-{_digest(script)}'" for script in inline)])  # also of handlers
     policy = (
         f"default-src 'self'; script-src 'self' 'unsafe-eval' {hashes}; style-src 'self' 'unsafe-inline'; "
         "img-src 'self' blob: data:; frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
