@@ -145,7 +145,7 @@ class Page:
             "const shown = [...one.querySelectorAll('.signal')].find(one => one.children[1].textContent === signal);"
             "const painted = () => new Promise(go => requestAnimationFrame(() => requestAnimationFrame(go)));"
             "const seen = new Promise(go => new IntersectionObserver(go).observe(one.querySelector('canvas')));"
-            "(async () => { await seen; const read = []; for (let share = 0; share < 1; share += 0.025) {"
+            "(async () => { await seen; const read = []; for (let share = 0; share <= 1; share += 1 / 64) {"
             "one.querySelector('canvas').dispatchEvent(new PointerEvent('pointermove',"
             "{clientX: box.left + 48 + share * (box.width - 56), clientY: box.top + 20}));"
             "await painted(); read.push(shown.querySelector('.num').textContent); }"

@@ -389,6 +389,28 @@ def test_curves_can_be_added_read_hidden_and_held(page: Page) -> None:
     page.until(f"{curve} === null")
 
 
+def test_a_part_of_a_curve_is_enlarged_by_dragging_over_it(page: Page) -> None:
+    page.until(RUNNING)
+    canvas = page.look("document.querySelector('.curve canvas')")
+    page.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    shown = "document.querySelector('#scroll-back').getAttribute('aria-valuetext')"
+    page.choose("#span", "2")
+    page.click("#pause-curves")
+    from_s, to_s = (float(one) for one in re.findall(r"[\d.]+(?= s)", page.look(shown)))
+    assert to_s - from_s == pytest.approx(2.0)
+    half = canvas.size["width"] // 4
+    ActionChains(page.driver).move_to_element_with_offset(canvas, -half, 0).click_and_hold().move_by_offset(
+        half, 0
+    ).release().perform()
+    page.until(f"{shown} !== '{from_s:.2f} s to {to_s:.2f} s'")
+    left, right = (float(one) for one in re.findall(r"[\d.]+(?= s)", page.look(shown)))
+    assert from_s < left < right < to_s
+    assert right - left == pytest.approx(0.5, abs=0.15)
+    ActionChains(page.driver).double_click(canvas).move_to_element(page.find("h1")).perform()
+    page.until("document.querySelector('#scroll-back').hidden")
+    page.choose("#span", "8")
+
+
 def test_held_curves_outlive_a_reset(page: Page) -> None:
     page.until(RUNNING)
     for target in (0.0, 0.9):

@@ -7,6 +7,7 @@ const DASHES = [[], [6, 3], [2, 2]]; // more signals than colours
 const PAD = { left: 46, right: 6, top: 6, bottom: 16 };
 const SHOWN_AT_FIRST = 6;
 const LEAST_S = 0.2;
+const LEAST_DRAG = 8; // pixels
 const GAP = 4; // times the mean distance
 
 /** Values over time; cleared when time goes back. */
@@ -52,7 +53,7 @@ function ticks(low, high, count) {
 }
 
 export class Chart {
-  constructor(source, view, data, { close, touchAll }) {
+  constructor(source, view, data, { close, touchAll, zoom }) {
     Object.assign(this, { source, view, data, signature: source.signature, stale: true, seen: false });
     this.hidden = new Set(source.signals.slice(SHOWN_AT_FIRST).map((_, i) => i + SHOWN_AT_FIRST));
     this.canvas = h("canvas", { role: "img", "aria-label": `${source.title} over time${source.unit ? `, ${source.unit}` : ""}` });
@@ -70,12 +71,24 @@ export class Chart {
         h("button", { class: "tiny", title: `Remove ${source.title}`, "aria-label": `Remove ${source.title}`, onclick: close }, "×")),
       this.canvas, legend);
     new IntersectionObserver(([entry]) => { this.seen = entry.isIntersecting; this.stale = true; }).observe(this.canvas);
+    const share = (event) => (event.offsetX - PAD.left) / (this.canvas.clientWidth - PAD.left - PAD.right);
+    const time = (at) => this.end - (1 - Math.min(1, Math.max(0, at))) * this.span;
+    let began = null; // where a drag began: pixel and time
+    this.canvas.addEventListener("pointerdown", (event) => {
+      if (event.button !== 0 || event.pointerType === "touch") return; // fingers scroll the page
+      began = { x: event.offsetX, time: time(share(event)) };
+      this.canvas.setPointerCapture(event.pointerId);
+    });
     this.canvas.addEventListener("pointermove", (event) => {
-      const width = this.canvas.clientWidth - PAD.left - PAD.right;
-      const share = (event.offsetX - PAD.left) / width;
-      view.hover = share >= 0 && share <= 1 ? this.end - (1 - share) * this.span : null;
+      const at = share(event);
+      view.hover = at >= 0 && at <= 1 ? time(at) : null;
+      const ends = began && Math.abs(event.offsetX - began.x) >= LEAST_DRAG ? [began.time, time(at)] : null;
+      view.marked = ends && [Math.min(...ends), Math.max(...ends)];
       touchAll();
     });
+    this.canvas.addEventListener("pointerup", () => { if (view.marked) zoom(view.marked); });
+    this.canvas.addEventListener("lostpointercapture", () => { began = view.marked = null; touchAll(); });
+    this.canvas.addEventListener("dblclick", () => zoom(null));
     this.canvas.addEventListener("pointerleave", () => { view.hover = null; touchAll(); });
   }
 
@@ -142,6 +155,12 @@ export class Chart {
       if (time < 0) continue;
       paint.fillText(`${time.toFixed(along.digits)} s`, Math.min(Math.max(x(time), PAD.left + 12), width - 14), height - 6);
       paint.beginPath(); paint.moveTo(x(time), PAD.top); paint.lineTo(x(time), height - PAD.bottom); paint.stroke();
+    }
+    if (this.view.marked) {
+      const [left, right] = this.view.marked.map(x);
+      paint.globalAlpha = 0.15;
+      paint.fillRect(left, PAD.top, right - left, height - PAD.top - PAD.bottom);
+      paint.globalAlpha = 1;
     }
     paint.save();
     paint.beginPath(); paint.rect(PAD.left, 0, width - PAD.left - PAD.right, height); paint.clip();

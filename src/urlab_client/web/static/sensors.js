@@ -8,20 +8,22 @@ const SPANS = [2, 8, 30, 120];
 const AXES = { 3: ["x", "y", "z"], 4: ["w", "x", "y", "z"] };
 const KEPT_S = SPANS.at(-1);
 const span = h("select", { id: "span", "aria-label": "Seconds of the curves", onchange: () => {
+  view.zoomed = null;
   charts.forEach((chart) => chart.touch());
   if (replay) fill();
 } },
   SPANS.map((seconds) => h("option", { value: seconds, selected: seconds === 8 }, `${seconds} s`)));
 const pause = h("button", { id: "pause-curves", "aria-pressed": "false", onclick: () => hold(!view.held) }, "❚❚ Hold");
 const back = h("input", { type: "range", id: "scroll-back", min: 0, max: KEPT_S, step: "any", value: KEPT_S, "aria-label": "Scroll back", hidden: true,
-  oninput: () => { view.end = view.last - (1 - back.value / KEPT_S) * Math.max(0, view.last - view.first - view.span); charts.forEach((chart) => chart.touch()); } });
+  oninput: () => { view.end = view.last - (1 - back.value / KEPT_S) * Math.max(0, view.last - view.first - view.span); told(); } });
 const probe = h("i", { hidden: true });
 
 /**
- * Shared by all curves: the end of the time span (the newest state unless held), and the pointer's position. Curves that
- * are held stay as they are when the simulation is reset: what comes afterwards is kept apart.
+ * Shared by all curves: the end of the time span (the newest state unless held), the pointer's position, the part that is
+ * being marked, and the seconds of one that was enlarged. Curves that are held stay as they are when the simulation is
+ * reset: what comes afterwards is kept apart.
  */
-const view = { held: false, apart: false, end: 0, last: 0, first: 0, hover: null, get span() { return +span.value; } };
+const view = { held: false, apart: false, end: 0, last: 0, first: 0, hover: null, marked: null, zoomed: null, get span() { return this.zoomed ?? +span.value; } };
 /** What came, by curve: of the simulation, and of a recording. */
 const kept = { live: new Map(), recorded: new Map() };
 let all = []; // the sources of all curves, shown or not
@@ -98,11 +100,28 @@ function jumped(time) {
 
 function hold(held) {
   if (view.apart) connect();
-  Object.assign(view, { held, end: view.last });
+  Object.assign(view, { held, end: view.last, zoomed: null });
   pause.setAttribute("aria-pressed", held);
   pause.textContent = held ? "▶ Follow" : "❚❚ Hold";
   back.hidden = !held;
   back.value = KEPT_S;
+  told();
+}
+
+/** Hold the curves and enlarge a part, from one time to another; or follow again. */
+function zoom(part) {
+  if (!part) return hold(false);
+  if (!view.held) hold(true);
+  const [from, to] = part;
+  Object.assign(view, { zoomed: to - from, end: to });
+  const room = view.last - view.first - view.span;
+  back.value = room > 0 ? KEPT_S * (1 - (view.last - to) / room) : KEPT_S;
+  told();
+}
+
+/** Draw the curves over another time, and say which. */
+function told() {
+  back.setAttribute("aria-valuetext", `${(view.end - view.span).toFixed(2)} s to ${view.end.toFixed(2)} s`);
   charts.forEach((chart) => chart.touch());
 }
 
@@ -157,7 +176,7 @@ export function makeSensors() {
     const robots = new Set(all.map((source) => source.art));
     charts = all.filter((source) => chosen.get(source.key) ?? source.shown).map((source) => {
       const { signature } = source;
-      const chart = old.get(signature) ?? new Chart(source, view, dataOf(store(), signature), { close: () => choose(source.key, false), touchAll: () => charts.forEach((one) => one.touch()) });
+      const chart = old.get(signature) ?? new Chart(source, view, dataOf(store(), signature), { close: () => choose(source.key, false), touchAll: () => charts.forEach((one) => one.touch()), zoom });
       chart.source = source;
       return chart;
     });
