@@ -197,7 +197,7 @@ def test_a_robot_with_torque_motors_holds_its_home_pose_until_somebody_commands_
     assert http.post("/api/hold", json={"quadruped": False}).status_code == 200
     assert height() < 0.2
     said = [entry["what"] for entry in http.get("/api/log").json() if entry["kind"] == "call"]
-    assert said[-2:] == ["hold pose", "let go"]
+    assert [one for one in said if one != "step"][-2:] == ["hold pose", "let go"]
     assert "'quadruped'" in refusal(http.post("/api/hold", json={"nobody": True}))
     assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
     http.post("/api/ops/set_mode", json={"mode": "live"})

@@ -7,7 +7,9 @@ if the browser disappears.
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -16,13 +18,16 @@ from numpy.typing import NDArray
 
 from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.mujoco_viewer import MujocoViewer, Shown, no_model
+from urlab_client.console.pictures import Cameras
 from urlab_client.console.replay import Replay
+from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.values.names import split_prefix
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
+_POSED_S = 0.25  # as much time passes at most
 _HELD_S = 0.6
 _VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 
@@ -70,14 +75,65 @@ class Push(Struct, forbid_unknown_fields=True):
     target: Vector
 
 
+class Posing:
+    """Places robots in puppet mode.
+
+    Time passes as on the wall while viewers pose, so that curves and recordings show the motion.
+    """
+
+    def __init__(self, client: URLabClient, lease: DrivingLease, view: SharedView, cameras: Cameras) -> None:
+        self._client = client
+        self._lease = lease
+        self._view = view
+        self._cameras = cameras
+        self._at = 0.0
+
+    async def place(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
+        """Place joints of one coordinate, by articulation and joint, or none if one cannot be."""
+        if self._client.step_mode is not StepMode.PUPPET:
+            raise ValueError(f"posing needs puppet mode, not {self._client.step_mode}, in which physics moves joints")
+        if (data := self._client.data) is None:
+            raise ValueError("posing needs a local model, and none could be compiled")
+        robots = self._client.articulations
+        joints = [(robots[key].joints[name], value) for key, given in values.items() for name, value in given.items()]
+        for joint, value in joints:
+            if joint.kind not in ("hinge", "slide"):
+                raise ValueError(f"{joint.name} is a {joint.kind} joint: only hinge and slide joints take one number")
+            low, high = joint.limits or (-math.inf, math.inf)
+            if not low <= value <= high:
+                raise ValueError(f"{joint.name} goes from {low:g} to {high:g} {joint.unit}: {value:g} is out of reach")
+        self._lease.use(viewer)
+        for joint, value in joints:
+            data.qpos[joint.qpos_offset] = value
+        for key, given in values.items():
+            self._view.note_burst(viewer.name, "pose", key, given)
+        await self.push()
+
+    async def push(self) -> None:
+        """Send the pose of the local data, with the pictures that are watched, which come with replies alone."""
+        now, data = time.monotonic(), self._client.data
+        if data is not None:
+            data.time += min(max(now - self._at, self._view.world.timestep or _POSED_S), _POSED_S)
+        self._at = now
+        await self._client.step(0, include_cameras=dict.fromkeys(self._cameras.watched(), "sync") or False)
+
+
 class BodyPushing:
     """The bodies of one console, and at most one push at a time."""
 
-    def __init__(self, client: URLabClient, lease: DrivingLease, viewer: MujocoViewer, replay: Replay) -> None:
+    def __init__(
+        self,
+        client: URLabClient,
+        lease: DrivingLease,
+        viewer: MujocoViewer,
+        replay: Replay,
+        posing: Posing,
+    ) -> None:
         self._client = client
         self._lease = lease
         self._viewer = viewer
         self._replay = replay
+        self._posing = posing
         self._push: Push | None = None
         self._by: Viewer | None = None
         self._until = 0.0
@@ -178,7 +234,7 @@ class BodyPushing:
         at = int(model.jnt_qposadr[joint])
         point = shown.data.xpos[push.body] + shown.data.xmat[push.body].reshape(3, 3) @ np.array(push.local)
         data.qpos[at : at + 3] = shown.data.qpos[at : at + 3] + np.array(push.target) - point
-        await self._client.step(0)
+        await self._posing.push()
 
 
 def _checked(shown: Shown, body: int) -> int:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import anyio
 import msgspec
+import numpy as np
 from msgspec import Struct, structs
 
+from urlab_client.aio.controllers import URLabPDController
 from urlab_client.console.description import home_of
 from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.messages import encode
@@ -60,7 +61,8 @@ SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is n
 """The ops that viewers may perform, by name; the console itself holds the session."""
 
 _PERIOD_S = 1 / 60
-_BURST_S = 5.0
+_MOST_STEPS = 200  # in one request, so that a viewer can stop them
+_DIGITS = 6
 _FREQUENCY, _DAMPING = 40.0, 0.4
 """Frequency in rad/s and damping ratio of a joint that holds its pose."""
 
@@ -113,12 +115,12 @@ class Controls:
         self._cameras = cameras
         self._before_step = before_step
         self._wake_runner = asyncio.Event()
-        self._seeded: set[str] = set()
+        self._seeded: dict[str, list[float]] = {}  # with which set-points a robot was kept as it was
         self._driven: dict[str, str] = {}  # the session in which viewers gave a robot set-points
-        self._driving: dict[tuple[str, ...], float] = {}
         self._pending: set[str] = set()
         self._commanded = asyncio.Event()
         self._pictures_due = 0.0
+        self._halted = False  # by a viewer, since a number of steps began
 
     def begin_anew(self, *, ended: bool) -> None:
         """Discard the state of the previous play session; its set-points would drive the robots of the next.
@@ -151,7 +153,7 @@ class Controls:
         try:
             reply = await _perform(self._client, request)
         except (URLabError, ValueError, TypeError, KeyError) as error:
-            if not (self._client.config.read_only and op.effect is Effect.READ):  # which the page asks for by itself
+            if op.effect is not Effect.READ:  # whoever reads is told; the page does so by itself, again and again
                 self._view.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
             raise
         if op.effect is not Effect.READ:
@@ -181,16 +183,31 @@ class Controls:
 
     def _start_again(self, reply: ResetOk) -> None:
         """After a reset, command the pose and the forces of its start, as MuJoCo does, and no earlier set-points."""
-        for key in self._driven.keys() - self.holding.keys():
+        for key, start in reply.per_articulation.items():
+            art = self._client.articulations.get(key)
+            if art is None or key in self.holding:
+                continue
+            ours = key in self._driven or self._seeded.get(key) == art.ctrl_array.tolist()
+            if not ours and not self._inherited(key, art, start):
+                continue
             self._forget(key)
-            if art := self._client.articulations.get(key):
-                _keep(art, reply.per_articulation.get(key))
-                self._pending.add(key)
-                self._commanded.set()
+            _keep(art, start)
+            self._seeded[key] = art.ctrl_array.tolist()
+            self._pending.add(key)
+            self._commanded.set()
+
+    def _inherited(self, key: str, art: URLabArticulation, start: ArticulationState) -> bool:
+        """Return whether the server would apply set-points of an earlier client again after a reset in live mode."""
+        if art.controller is not None or art.control_owner is not None or art.ctrl_array.any():
+            return False
+        before = None if self._view.snapshot is None else self._view.snapshot.per_articulation.get(key)
+        if self._client.step_mode is not StepMode.LIVE or before is None or before.ctrl is None or start.ctrl is None:
+            return False
+        return bool(np.any(np.asarray(before.ctrl) != np.asarray(start.ctrl)))
 
     def _forget(self, key: str) -> None:
         """Discard a robot's set-points."""
-        del self._driven[key]
+        self._driven.pop(key, None)
         self._pending.discard(key)
         if art := self._client.articulations.get(key):
             art.ctrl_array[:] = 0.0
@@ -213,38 +230,8 @@ class Controls:
             self._driven[key] = self._client.session_id
             self._pending.add(key)
             if noted and given:
-                self._note_once(viewer, "set-points", key, *given)
+                self._view.note_burst(viewer.name, "set-points", key, given)
         self._commanded.set()
-
-    def _note_once(self, viewer: Viewer, what: str, key: str, *names: str) -> None:
-        now, burst = time.monotonic(), (viewer.key, what, key, *names)
-        self._driving = {known: at for known, at in self._driving.items() if now - at < _BURST_S}
-        if burst not in self._driving:
-            self._view.note("call", viewer.name, what, encode({key: names}).decode())
-        self._driving[burst] = now
-
-    async def pose(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
-        """Place joints of one coordinate in puppet mode, by articulation and joint, or none if one cannot be."""
-        if self._client.step_mode is not StepMode.PUPPET:
-            raise ValueError(
-                f"posing needs puppet mode, not {self._client.step_mode}: elsewhere physics moves the joints"
-            )
-        if (data := self._client.data) is None:
-            raise ValueError("posing needs a local model, and none could be compiled")
-        robots = self._client.articulations
-        joints = [(robots[key].joints[name], value) for key, given in values.items() for name, value in given.items()]
-        for joint, value in joints:
-            if joint.kind not in ("hinge", "slide"):
-                raise ValueError(f"{joint.name} is a {joint.kind} joint: only hinge and slide joints take one number")
-            low, high = joint.limits or (-math.inf, math.inf)
-            if not low <= value <= high:
-                raise ValueError(f"{joint.name} goes from {low:g} to {high:g} {joint.unit}: {value:g} is out of reach")
-        self._lease.use(viewer)
-        for joint, value in joints:
-            data.qpos[joint.qpos_offset] = value
-        for key, given in values.items():
-            self._note_once(viewer, "pose", key, *given)
-        await self._client.step(0)
 
     async def hold(self, viewer: Viewer, name: str, holding: bool) -> None:
         """Make a robot with torque motors hold its home pose, or let it go.
@@ -273,10 +260,11 @@ class Controls:
         """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
         if key in self._seeded:
             return
-        self._seeded.add(key)
         state = None if self._view.snapshot is None else self._view.snapshot.per_articulation.get(key)
-        if not art.ctrl_array.any():
+        free = not art.ctrl_array.any()  # of commands by the program around the console
+        if free:
             _keep(art, state)
+        self._seeded[key] = art.ctrl_array.tolist() if free else []
 
     async def send_set_points(self) -> None:
         """Send set-points in live mode, one request at a time."""
@@ -303,6 +291,8 @@ class Controls:
             raise ValueError(f"stepping needs direct mode, not {self._client.step_mode}")
         self._lease.use(viewer)
         self._pictures_due = 0.0
+        self._halted = False
+        self._view.note("call", viewer.name, "step", encode({"n_steps": n_steps}).decode())
         return await self._step(n_steps)
 
     async def _step(self, n_steps: int) -> SteppedTo:
@@ -311,14 +301,14 @@ class Controls:
         while True:
             self._before_step()
             self.holding = {key: hold for key, hold in self.holding.items() if hold.renew()}
-            taken = min(n_steps, self._per_period) if self.holding else n_steps
+            taken = min(n_steps, self._per_period if self.holding else _MOST_STEPS)
             began = time.monotonic()
             watched = dict.fromkeys(self._cameras.watched(), "latest") if began >= self._pictures_due else {}
             reply = await self._client.step(taken, include_cameras=watched or False)
             if watched:  # they take half of the time at most: drawing may be slower than physics
                 self._pictures_due = 2 * time.monotonic() - began
             n_steps -= taken
-            if not n_steps:
+            if not n_steps or self._halted:
                 return SteppedTo(reply.time, reply.step)
 
     @property
@@ -334,6 +324,7 @@ class Controls:
         if running and self._client.step_mode not in (StepMode.LIVE, StepMode.DIRECT):
             raise ValueError(f"in mode {self._client.step_mode} no physics runs: choose live or direct")
         self._suspended = False
+        self._halted = not running
         if self._client.step_mode is StepMode.LIVE:
             await self.do(viewer, SetPaused(paused=not running))
         else:
@@ -377,15 +368,31 @@ class Controls:
 
 
 def _keep(art: URLabArticulation, state: ArticulationState | None) -> None:
-    """Set the set-points that keep a robot as it is: its pose if the server controls it, otherwise what was applied."""
-    if state is None:
-        return
-    for actuator in art.actuators.values():
-        at = actuator.ctrl_local
-        if art.controller is not None and actuator.joint is not None:
-            actuator.set_control(float(state.qpos[art.joints[actuator.joint].qpos_local_offset]))
-        elif state.ctrl is not None:
-            art.ctrl_array[at] = state.ctrl[at]
+    """Set the set-points that keep a robot as it is."""
+    values = None if state is None else applied_set_points(art, state)
+    if values is not None:
+        art.ctrl_array[:] = values
+
+
+def applied_set_points(art: URLabArticulation, state: ArticulationState) -> list[float] | None:
+    """Return the set-points that the server applies, one per control; None if its state does not say.
+
+    A state has forces instead where a PD controller makes them; its law, with the gains, gives the set-points back.
+    """
+    pd = art.controller if isinstance(art.controller, URLabPDController) else None
+    if state.ctrl is None and pd is None:
+        return None
+    values = np.zeros(len(art.ctrl_array)) if state.ctrl is None else np.array(state.ctrl, np.float64)
+    if pd is not None:
+        for actuator in art.actuators.values():
+            kp = pd.kp.get(actuator.name)
+            if actuator.joint is None or kp is None:
+                continue
+            joint, at = art.joints[actuator.joint], actuator.ctrl_local.start
+            position, velocity = state.qpos[joint.qpos_local_offset], state.qvel[joint.qvel_local_offset]
+            damping = pd.kv.get(actuator.name, 0.0) * velocity
+            values[at] = position + ((values[at] + damping) / kp if kp else 0.0)
+    return [round(value, _DIGITS) for value in values.tolist()]
 
 
 class _PoseHold:

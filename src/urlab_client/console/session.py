@@ -19,8 +19,8 @@ import anyio.to_thread
 from msgspec import structs
 
 from urlab_client.aio.background import kept_running
-from urlab_client.console.body_pushing import BodyPushing
-from urlab_client.console.controls import Controls
+from urlab_client.console.body_pushing import BodyPushing, Posing
+from urlab_client.console.controls import Controls, applied_set_points
 from urlab_client.console.hand_driving import HandDriving
 from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.messages import Link, Status, encode, rounded
@@ -42,6 +42,7 @@ from urlab_client.events import (
     SessionLost,
     SessionOpened,
 )
+from urlab_client.protocol.messages.session import ArticulationState
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -86,7 +87,8 @@ class ConsoleSession:
         self.recordings: Recordings = Recordings(client, recordings)
         self.replay: Replay = Replay(client, view, self.cameras, alone=replayed is not None)
         self._replayed = replayed
-        self.body_pushing: BodyPushing = BodyPushing(client, lease, self.mujoco_viewer, self.replay)
+        self.posing: Posing = Posing(client, lease, view, self.cameras)
+        self.body_pushing: BodyPushing = BodyPushing(client, lease, self.mujoco_viewer, self.replay, self.posing)
         self.controls: Controls = Controls(client, lease, view, self.cameras, self.body_pushing.apply)
         self.hands: HandDriving = HandDriving(client, lease, self.controls, view)
         self._handshake = handshake
@@ -246,6 +248,8 @@ class ConsoleSession:
 
     def _follow(self, event: ClientEvent) -> None:
         """Handle an event of the connection."""
+        if isinstance(event, SessionLost) and self.link.state == "taken_over":
+            return  # each refused call tells again
         self.view.note("event", "server", str(event.__struct_config__.tag), _text_of(event))
         match event:
             case ServerLost():
@@ -298,7 +302,8 @@ class ConsoleSession:
                             self.reconnect()  # play has restarted; the driver provides a new handshake
                             await anyio.sleep(_RETRY_S)
                         elif not self.replay.open:
-                            self.view.show(snapshot, {key: self._targets(key) for key in snapshot.per_articulation})
+                            robots = snapshot.per_articulation.items()
+                            self.view.show(snapshot, {key: self._targets(key, state) for key, state in robots})
                         # By the clock, not by the wake-up time: otherwise each late wake-up would lower the rate.
                         due = max(due + _PERIOD_S, time.monotonic() - _PERIOD_S)
                         await anyio.sleep(max(0.0, due - time.monotonic()))
@@ -308,14 +313,19 @@ class ConsoleSession:
                 self._note_error("state", error)
                 await anyio.sleep(_RETRY_S)
 
-    def _targets(self, key: str) -> list[float] | None:
+    def _targets(self, key: str, state: ArticulationState) -> list[float] | None:
+        """Return a robot's set-points: what viewers command, or what else the server applies; None if not known."""
         art = self.client.articulations.get(key)
-        return rounded(art.ctrl_array) if art is not None and self.controls.commands(key) else None
+        if art is None:
+            return None
+        if self.controls.commands(key) and self.link.state != "taken_over" and self.controls.source != "ui":
+            return rounded(art.ctrl_array)
+        return applied_set_points(art, state)
 
     @property
     def moving(self) -> bool:
         """Whether simulation time advances."""
-        return self.link.state == "connected" and self._clock.advances
+        return self.link.state in {"connected", "taken_over"} and self._clock.advances
 
     # Viewers
 

@@ -11,7 +11,7 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 log: logging.Logger = logging.getLogger("urlab_client.web")
 
 _KEPT = 300
+_BURST_S = 5.0
 
 
 class SharedView:
@@ -51,6 +52,7 @@ class SharedView:
         self._client = client
         self._watchers: set[asyncio.Event] = set()
         self._n = 0
+        self._bursts: dict[tuple[str, ...], float] = {}
 
     @contextlib.contextmanager
     def watch(self) -> Generator[asyncio.Event]:
@@ -77,6 +79,14 @@ class SharedView:
         self._n += 1
         self.entries.append(LogEntry(self._n, time.time(), kind, who, what, text, ms))
         self.notify()
+
+    def note_burst(self, who: str, what: str, robot: str, names: Iterable[str]) -> None:
+        """Add a line on what moves parts of a robot: one for all that follow one another."""
+        now, burst = time.monotonic(), (who, what, robot, *names)
+        self._bursts = {known: at for known, at in self._bursts.items() if now - at < _BURST_S}
+        if burst not in self._bursts:
+            self.note("call", who, what, encode({robot: burst[3:]}).decode())
+        self._bursts[burst] = now
 
     def entries_after(self, n: int) -> list[LogEntry]:
         """Return the entries after number `n`, of those that are kept."""

@@ -226,7 +226,7 @@ async def hold(call: Call, body: dict[str, bool]) -> None:
 @endpoint("POST", "/api/pose")
 async def pose(call: Call, body: dict[str, dict[str, float]]) -> None:
     """Place joints in puppet mode: `{articulation: {joint: radians or metres}}`. Requires the controls."""
-    await call.console.controls.pose(call.viewer, body)
+    await call.console.posing.place(call.viewer, body)
 
 
 # Bodies

@@ -239,7 +239,7 @@ class Run:
         """Return what the names of each articulation begin with in `model()`; files of earlier releases do not say."""
         channels = self._index().channels_of(_STATES)
         keys = {channel.topic.removeprefix(_ARTICULATION): channel.layout.prefix for channel in reversed(channels)}
-        return {key: prefix or key for key, prefix in keys.items()}
+        return {key: prefix or key for key, prefix in reversed(keys.items())}
 
     def model(self) -> mujoco.MjModel:
         """Return the compiled model of the first scene.

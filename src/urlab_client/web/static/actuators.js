@@ -66,7 +66,7 @@ export class ActuatorRow {
   /** Set what was typed, and say where it ends. */
   type(value) {
     const [low, high] = this.actuator.range ?? [-Infinity, Infinity];
-    if (value < low || value > high) toast(`${this.actuator.name} goes from ${shortly(low)} to ${shortly(high)} ${this.actuator.unit}: ${shortly(value)} is out of reach.`);
+    if (value < low || value > high) toast(`${this.actuator.name} goes from ${shortly(low)} to ${shortly(high)} ${this.actuator.unit}: ${shortly(value)} is out of reach, so it is set to ${shortly(value < low ? low : high)}.`);
     this.set(value);
   }
 
@@ -137,7 +137,7 @@ export function fallen(art, state) {
 /** What holds a robot, or the reason why it does not move, as far as its state shows it; or an empty string. */
 export function stillness(art, state, status) {
   if (status?.replay) return "";
-  if (status?.mode === "puppet") return "In mode puppet no physics runs. Place its joints below, or push it in the view.";
+  if (status?.mode === "puppet") return "In mode puppet no physics runs. Place its joints below" + (free(art) ? ", or push it in the view." : ".");
   if (status?.holding.includes(art.key) && fallen(art, state)) return "It holds its home pose, but has fallen. Press Reset to.";
   if (status?.holding.includes(art.key)) return `It holds its home pose ${status.moving ? "until you move a slider" : "as soon as physics runs"}.`;
   if (!art.actuators.length) return "It has no actuators: only gravity and contacts move it.";

@@ -13,6 +13,11 @@ let ran = false; // whether physics runs, or did before mode puppet
 export const paused = () => now.socket && now.status?.link.state === "connected" && !now.status.moving && !now.status.running;
 
 const STATE_DUE_MS = 5000;
+const MODES = {
+  live: "physics runs by itself, in real time",
+  direct: "physics advances only by steps: of this console, while it plays, or of a program",
+  puppet: "no physics; programs and people place the robots",
+};
 const RUN = "Run or pause physics (space)";
 const LINKS = {
   connected: "Connected",
@@ -33,7 +38,8 @@ function toggleSheet() {
 }
 
 export const run = (running) => ask("POST", "api/run", { running });
-export const step = (n) => ask("POST", "api/step", { n_steps: n });
+/** Take as many steps as the box says. */
+export const step = () => ui.steps.reportValidity() && ask("POST", "api/step", { n_steps: +ui.steps.value });
 export const reset = (keyframe) => op("reset", keyframe ? { keyframe_name: keyframe } : {});
 export const drive = () =>
   now.status?.mine ? ask("DELETE", "api/lease") : ask("POST", "api/lease");
@@ -48,8 +54,10 @@ export async function toggleRun() {
   if (now.status?.replay) toggleReplay();
   else if (now.status) {
     const { running } = now.status;
-    if (!running) await steady();
-    run(!running);
+    const { mode } = now.status;
+    const held = running ? [] : await steady();
+    await run(!running);
+    if (mode === "live" && held.length) toast(`Mode direct was chosen, in which ${held.join(", ")} can hold a pose.`, "good");
   }
 }
 
@@ -87,15 +95,15 @@ export function makeBar() {
   ui.rate = h("b", {}, "–");
   ui.play = h("button", { class: "primary", id: "play", title: RUN, onclick: toggleRun }, "▶ Play");
   ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; anyone can (escape)", onclick: stop }, "■ Stop");
-  ui.steps = h("input", { id: "steps", type: "number", min: 1, max: 10000, value: 10, title: "Steps at a time", "aria-label": "Steps at a time" });
-  ui.step = h("button", { id: "step", title: "Step, in direct mode (.)", onclick: () => step(+ui.steps.value || 1) }, "Step");
+  ui.steps = h("input", { id: "steps", type: "number", min: 1, max: 10000, step: 1, required: true, value: 10, title: "Steps at a time", "aria-label": "Steps at a time" });
+  ui.step = h("button", { id: "step", title: "Step, in direct mode (.)", onclick: step }, "Step");
   ui.keyframe = h("select", { id: "keyframe", "aria-label": "Keyframe" }, h("option", { value: "" }, "start"));
   ui.reset = h("button", { id: "reset", title: "Reset to the start or a keyframe (r)", onclick: () => reset(ui.keyframe.value) }, "Reset to");
   ui.mode = h("select", { id: "mode", "aria-label": "Step mode", onchange: () => choose(ui.mode.value) },
-    ...["live", "direct", "puppet"].map((mode) => h("option", {}, mode)));
+    ...Object.entries(MODES).map(([mode, what]) => h("option", { title: what }, mode)));
   ui.source = h("select", { id: "source", "aria-label": "Whose set-points drive", title: "Whose set-points drive the robots: those of programs and this console, or those of the editor's panel",
     onchange: () => ui.source.value && op("set_control_source", { source: ui.source.value }) },
-    h("option", { value: "", hidden: true }, "–"), h("option", { value: "zmq" }, "programs"), h("option", { value: "ui" }, "editor panel"));
+    h("option", { value: "", hidden: true }, "as it is"), h("option", { value: "zmq" }, "programs"), h("option", { value: "ui" }, "editor panel"));
   ui.speed = h("input", { id: "speed", type: "range", min: 5, max: 100, step: 5, value: 100, "aria-label": "Speed, percent of real time",
     onchange: () => op("set_sim_speed", { percent: +ui.speed.value }), oninput: () => text(ui.speedText, `${ui.speed.value} %`) });
   ui.speedText = h("span", { class: "num" }, "100 %");
@@ -103,7 +111,7 @@ export function makeBar() {
   ui.others = h("span", { class: "others" });
   ui.driver = h("span", { id: "driver", class: "pill" }, ui.who, ui.others);
   ui.drive = h("button", { id: "drive", title: "Take or release the controls (d)", onclick: drive }, "Take the controls");
-  ui.restart = confirmed({ id: "restart", title: "Begin a play session, or begin it anew; physics waits for Play" }, () => now.status?.playing ? "Restart play" : "Begin play",
+  ui.restart = confirmed({ id: "restart", title: "Begin a play session, or begin it anew" }, () => now.status?.playing ? "Restart play" : "Begin play",
     () => now.status?.playing && "Discard this simulation?", restartPlay);
 
   ui.sheet = h("button", { id: "sheet-toggle", "aria-expanded": "false", "aria-controls": "sheet", onclick: toggleSheet }, "Controls");
@@ -174,13 +182,16 @@ function show(status) {
   if (status.replay?.alone) text(ui.link, "Recorded file"); // there is no server to be connected with
   text(ui.address, status.replay?.alone ? "" : status.address);
   const unreachable = ["lost", "connecting"].includes(link) && !status.replay;
-  text(ui.rate, unreachable ? "–" : status.moving || status.running ? `${status.rate.toFixed(2)}×` : "paused");
+  text(ui.rate, unreachable || (!now.state && !status.replay) ? "–" : status.moving || status.running ? `${status.rate.toFixed(2)}×` : "paused");
   if (!unreachable) text(ui.play, (status.replay ? status.replay.playing : status.running) ? "❚❚ Pause" : "▶ Play");
   ui.play.disabled = unreachable || (!status.replay && (!status.playing || status.mode === "puppet"));
   ui.play.title = ui.play.disabled && status.mode === "puppet" ? "In mode puppet no physics runs: choose live or direct" : RUN;
-  ui.stop.disabled = unreachable;
+  const away = link === "taken_over"; // another program steps, resets and commands
+  ui.play.disabled ||= away;
+  ui.stop.disabled = unreachable || away;
   ui.step.disabled = ui.steps.disabled = status.mode !== "direct";
   if (document.activeElement !== ui.mode) ui.mode.value = status.mode;
+  ui.mode.title = `${status.mode}: ${MODES[status.mode] ?? ""}`;
   if (document.activeElement !== ui.source) ui.source.value = status.source ?? "";
   if (document.activeElement !== ui.speed && status.speed !== null) {
     ui.speed.value = status.speed;

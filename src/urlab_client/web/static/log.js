@@ -33,6 +33,8 @@ const each = (given, did, what) => Object.entries(given).map(([robot, names]) =>
 const CALLS = {
   set_paused: (given) => (given.paused ? "paused physics" : "let physics run"),
   run: () => "let physics run",
+  step: (given) => `took ${given.n_steps} step${given.n_steps === 1 ? "" : "s"}`,
+  configure_controller: (given) => Object.entries(given.params).map(([gain, values]) => `set ${gain.replaceAll("_", " ")} of ${given.articulation}: ${shortly(values)}`).join("; "),
   stop: () => "paused physics",
   reset: (given) => `reset the simulation${given.keyframe_name ? ` to ${given.keyframe_name}` : ""}`,
   set_mode: (given) => `chose step mode ${given.mode}`,

@@ -2,7 +2,7 @@
 
 import { drive, makeBar, now, reset, step, stop, toggleRun } from "./bar.js";
 import { makeCameras } from "./cameras.js";
-import { $, h } from "./dom.js";
+import { $, h, toast } from "./dom.js";
 import { makeLayout, resetLayout } from "./layout.js";
 import { connect } from "./link.js";
 import { makeLog } from "./log.js";
@@ -17,7 +17,7 @@ import { makeView } from "./view.js";
 const KEYS = [
   [" ", "space", "play or pause", toggleRun],
   ["Escape", "esc", "stop", stop],
-  [".", ".", "step (direct mode)", () => now.status?.mode === "direct" && step(+$("steps").value || 1)],
+  [".", ".", "step (direct mode)", () => (now.status?.mode === "direct" ? step() : toast("Steps need mode direct."))],
   ["r", "r", "reset", () => reset($("keyframe").value)],
   ["d", "d", "take or release the controls", drive],
   ["?", "?", "show this help", () => $("help").showModal()],

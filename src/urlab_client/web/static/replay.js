@@ -67,7 +67,7 @@ export function makeReplay() {
     document.body.classList.toggle("replaying", replay !== null);
     document.body.classList.toggle("serverless", replay?.alone ?? false);
     // Controls of the simulation would act unseen, or not at all.
-    const useless = replay !== null || ["lost", "connecting"].includes(status.link.state);
+    const useless = replay !== null || ["lost", "connecting", "taken_over"].includes(status.link.state);
     for (const part of ["#robots", "#teleop", ".more"]) document.querySelector(part).inert = useless;
     if (!replay) return;
     text(name, replay.name.replace(/\.mcap$/, ""));

@@ -147,8 +147,11 @@ class Robot {
 const hold = (articulation, holding) => ask("POST", "api/hold", { [articulation]: holding });
 
 /** Before physics runs: make those robots hold their pose that would collapse, unless the editor's panel drives them. */
-export const steady = () => Promise.all(robots.filter((robot) => now.status.source !== "ui" && limp(robot.art, now.state?.articulations[robot.key]) && !now.status.holding.includes(robot.key))
-  .map((robot) => hold(robot.key, true)));
+export async function steady() {
+  const held = robots.filter((robot) => now.status.source !== "ui" && limp(robot.art, now.state?.articulations[robot.key]) && !now.status.holding.includes(robot.key)).map((robot) => robot.key);
+  await Promise.all(held.map((key) => hold(key, true)));
+  return held;
+}
 
 const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 

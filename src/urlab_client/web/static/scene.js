@@ -1,6 +1,7 @@
 // The level: its actors, spawning, moving and removing them; and contacts.
 
 import { $, choices, confirmed, h, heading, number, text, toast } from "./dom.js";
+import { now } from "./bar.js";
 import { ask, on, op } from "./link.js";
 import { fold } from "./robots.js";
 
@@ -198,7 +199,7 @@ export function makeContacts() {
   box.firstChild.append(count);
   $("contacts").append(box);
   const look = async () => {
-    if (box.open && !document.hidden && !document.body.classList.contains("stale")) {
+    if (box.open && !document.hidden && now.status?.playing && now.status.link.state === "connected") {
       const answer = await op("get_contacts", { max_contacts: 32 }, { quiet: true });
       text(count, answer ? `${answer.n_contacts}${answer.truncated ? "+" : ""}` : "");
       list.replaceChildren(...(answer?.contacts ?? []).map((contact) => h("div", { class: "line" },

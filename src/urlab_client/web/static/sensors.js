@@ -57,7 +57,7 @@ function take(state) {
     if (values) dataOf(curves, source.signature).add(state.time, values, shown.has(source.signature) ? KEPT_S : view.span);
   }
   if (curves !== store() || view.apart) return;
-  if (state.time < view.last) view.first = state.time;
+  if (!view.last || state.time < view.last) view.first = state.time;
   view.last = state.time;
   view.first = Math.max(view.first, view.last - KEPT_S);
   if (!view.held) charts.forEach((chart) => chart.touch());
