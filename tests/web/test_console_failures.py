@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import json
 import math
 from collections.abc import AsyncGenerator
 from pathlib import Path
@@ -30,7 +31,7 @@ from urlab_client.integrations.record import record
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Reset, ResetOk
 from urlab_client.protocol.messages.sim import BeginPie, StopPie
-from urlab_client.server import SimulatedServer
+from urlab_client.server import ControllerConfig, SimulatedServer
 from urlab_client.web import app
 
 ME = Viewer("key", "me")
@@ -67,10 +68,17 @@ def once(monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> None:
 @contextlib.asynccontextmanager
 async def mounted(folder: Path, mode: str = "direct") -> AsyncGenerator[tuple[URLabClient, ConsoleSession]]:
     """Run a program that mounts a console."""
-    async with (
-        SimulatedServer("arm", play=True) as server,
-        URLabClient(**server.client_options(), step_mode=mode) as client,
-    ):
+    with SimulatedServer("arm", play=True) as server:
+        async with connected(server, folder, mode) as (client, console):
+            yield client, console
+
+
+@contextlib.asynccontextmanager
+async def connected(
+    server: SimulatedServer, folder: Path, mode: str
+) -> AsyncGenerator[tuple[URLabClient, ConsoleSession]]:
+    """Run a program that mounts a console of a server."""
+    async with URLabClient(**server.client_options(), step_mode=mode) as client:
         site = app(client, recordings=folder)
 
         @contextlib.asynccontextmanager
@@ -162,7 +170,7 @@ async def test_set_points_of_a_play_session_do_not_drive_the_next(tmp_path: Path
         await until(lambda: console.view.snapshot is not None)
         first, second, *_ = client.articulations["arm"].actuators
         console.controls.set_points(ME, {"arm": {first: 0.4}})
-        await until(lambda: 0.4 in arm_set_points(console))
+        await until(lambda: 0.4 in shown_targets(console))
         await console.controls.do(ME, StopPie())
         await until(lambda: any(entry.what == "play_ended" for entry in console.view.entries))
         await console.controls.do(ME, BeginPie())
@@ -226,6 +234,61 @@ async def test_a_reset_begins_without_earlier_set_points(mode: str, tmp_path: Pa
         assert arm.ctrl_array[0] == 0.3
 
 
+async def test_set_points_of_an_earlier_client_are_shown_kept_and_ended_by_a_reset(tmp_path: Path) -> None:
+    with SimulatedServer("arm", play=True, unpaused=True) as server:
+        async with URLabClient(**server.client_options(), step_mode="live") as earlier:
+            await earlier.discover()
+            first, second, *_ = earlier.articulations["arm"].actuators
+            earlier.articulations["arm"].set_ctrl({first: 0.4})
+            await earlier.step()
+        async with connected(server, tmp_path, "live") as (client, console):
+            await until(lambda: shown_targets(console)[:1] == [0.4])
+            console.controls.set_points(ME, {"arm": {second: 0.1}})
+            assert client.articulations["arm"].ctrl_array[:2].tolist() == pytest.approx([0.4, 0.1])
+        async with connected(server, tmp_path, "live") as (_, console):
+            await until(lambda: 0.4 in shown_targets(console))
+            await console.controls.do(ME, Reset())
+            await until(lambda: not any(arm_set_points(console)))
+
+
+async def test_a_moved_joint_leaves_the_set_points_of_a_controller_as_they_are(tmp_path: Path) -> None:
+    """Weight holds the joints away from their set-points: what is measured must not become what is commanded."""
+    pd = {"quadruped": ControllerConfig(kp=40.0, kv=1.5)}
+    with SimulatedServer("quadruped", play=True, controllers=pd) as server:
+        async with URLabClient(**server.client_options(), step_mode="direct") as client:
+            await client.discover()
+            robot = client.articulations["quadruped"]
+            robot.set_ctrl({"FL_thigh": 0.3})
+            await client.step(2000)
+            wanted = robot.ctrl_array.tolist()
+            assert max(abs(robot.dof_qpos - wanted)) > 0.05
+        async with connected(server, tmp_path, "direct") as (client, console):
+            await until(lambda: shown_targets(console, "quadruped") != [])
+            assert shown_targets(console, "quadruped") == pytest.approx(wanted, abs=0.002)
+            console.controls.set_points(ME, {"quadruped": {"FL_hip": 0.1}})
+            assert client.articulations["quadruped"].ctrl_array.tolist() == pytest.approx([0.1, *wanted[1:]], abs=0.002)
+
+
+async def test_posing_takes_time_so_that_it_can_be_recorded(tmp_path: Path) -> None:
+    async with mounted(tmp_path, "puppet") as (client, console):
+        joint = next(name for name, one in client.articulations["arm"].joints.items() if one.kind == "hinge")
+        before = client.sim_time
+        for value in (0.1, 0.2):
+            await console.posing.place(ME, {"arm": {joint: value}})
+            assert client.sim_time > before
+            assert client.sim_time - before < 1.0
+            before = client.sim_time
+
+
+async def test_a_stop_ends_a_large_number_of_steps(tmp_path: Path) -> None:
+    async with mounted(tmp_path) as (client, console):
+        many = asyncio.ensure_future(console.controls.step(ME, 1_000_000))
+        await until(lambda: client.step_count > 0)
+        await console.controls.run(ME, running=False)
+        done = await many
+        assert 0 < done.step == client.step_count < 1_000_000
+
+
 async def test_the_log_says_once_who_sets_which_set_points(tmp_path: Path) -> None:
     async with mounted(tmp_path) as (client, console):
         first, second, *_ = client.articulations["arm"].actuators
@@ -234,6 +297,11 @@ async def test_the_log_says_once_who_sets_which_set_points(tmp_path: Path) -> No
         console.controls.set_points(ME, {"arm": {second: 0.1}})
         said = [(entry.who, entry.text) for entry in console.view.entries if entry.what == "set-points"]
         assert said == [("me", f'{{"arm":["{name}"]}}') for name in (first, second)]
+
+
+def shown_targets(console: ConsoleSession, robot: str = "arm") -> list[float]:
+    found = json.loads(console.view.state_json or "{}").get("articulations", {}).get(robot, {}).get("targets")
+    return found or []
 
 
 def arm_set_points(console: ConsoleSession) -> list[float]:

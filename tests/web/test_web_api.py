@@ -443,7 +443,9 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         assert rows[0].startswith("time,sim_time")
         assert len(rows) == len(table)  # a header, and a row for each state but the last, which no action follows
         camera = made["cameras"][0]
-        assert b"ftyp" in http.get(f"/api/recordings/{name}?as=mp4&camera={camera}").content[:16]
+        film = http.get(f"/api/recordings/{name}?as=mp4&camera={camera}")
+        assert b"ftyp" in film.content[:16]
+        assert f"-{camera.replace('/', '-')}.mp4" in film.headers["content-disposition"]
         assert http.get(f"/api/recordings/{name}?as=mp4&camera=none").status_code == 400
         for wrong in ("none.mcap", "..%2F..%2Fetc%2Fpasswd", "a.txt"):
             assert http.get(f"/api/recordings/{wrong}").status_code in {400, 404}

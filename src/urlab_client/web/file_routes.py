@@ -118,7 +118,8 @@ async def download(call: Call, name: str, as_: str = "", camera: str = "") -> Re
     request.scope[JOB] = f"the conversion of {name} to {as_}"
     async with contextlib.AsyncExitStack() as stack:
         path = await _while_present(request, stack.enter_async_context(made.converted(name, as_, camera)))
-        return _Converted(path, stack.pop_all())
+        of = f"-{camera.replace('/', '-')}" if as_ == "mp4" else ""
+        return _Converted(path, f"{path.stem}{of}{path.suffix}", stack.pop_all())
 
 
 @endpoint("PUT", "/api/recordings/{name}", drives=True, upload=True)
@@ -193,8 +194,8 @@ async def import_model(call: Call, name: str, replace: str = "") -> Response:
 class _Converted(FileResponse):
     """A converted recording, which is deleted after the response, sent or not."""
 
-    def __init__(self, path: Path, made: contextlib.AsyncExitStack) -> None:
-        super().__init__(path, filename=path.name)
+    def __init__(self, path: Path, name: str, made: contextlib.AsyncExitStack) -> None:
+        super().__init__(path, filename=name)
         self._made = made
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

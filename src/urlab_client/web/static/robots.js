@@ -6,6 +6,7 @@ import { $, h, heading, number, text } from "./dom.js";
 import { ask, newest, on, op } from "./link.js";
 
 let robots = [];
+const PRESSING_N = 5;
 const GAINS = ["kp", "kv", "torque_limit"];
 
 class Robot {
@@ -165,19 +166,29 @@ const PRESS = [
   [/Raise it with set_gains\(\)\./, "Raise it under “Gains”."],
 ];
 
+/** Where parts of a robot press against each other, the strongest first. */
+async function pressing(key) {
+  if (!now.status?.playing || now.status.link.state !== "connected") return [];
+  const answer = await op("get_contacts", { max_contacts: 64 }, { quiet: true });
+  const own = (answer?.contacts ?? []).filter(({ body1, body2 }) => [body1, body2].every((body) => body?.startsWith(`${key}_`)));
+  own.sort((one, other) => other.force[0] - one.force[0]);
+  return own.filter(({ force }) => force[0] > PRESSING_N).slice(0, 3)
+    .map(({ body1, body2, force }) => `Its parts ${body1} and ${body2} press against each other with ${force[0].toFixed(0)} N.`);
+}
+
 /** Show the client's diagnosis of a robot that does not move. */
 async function explain(key) {
-  const answer = await ask("GET", "api/explain");
+  const [answer, pressed] = await Promise.all([ask("GET", "api/explain"), pressing(key)]);
   if (!answer) return;
   const robot = robots.find((one) => one.key === key);
   const said = robot && now.state ? stillness(robot.art, now.state.articulations[key], now.status) : "";
   const beside = now.status?.mode === "puppet" ? ["steps", key] : []; // where no step and no set-point is wanted
   const findings = answer.findings.filter((one) => !beside.includes(one.subject) && one.verdict !== "ok" && (one.subject === key || !document.querySelector(`[data-robot="${one.subject}"]`)));
   $("findings").replaceChildren(h("h2", {}, `Why does ${key} not move?`),
-    ...[said, now.status?.mode === "direct" && !now.status.running ? "Nothing steps it now. Press Play." : ""].filter(Boolean).map((one) => h("p", {}, one)),
+    ...[said, ...pressed, now.status?.mode === "direct" && !now.status.running ? "Nothing steps it now. Press Play." : ""].filter(Boolean).map((one) => h("p", {}, one)),
     h("ul", {}, findings.map((one) => h("li", { class: one.verdict }, h("b", {}, one.subject),
       ` ${PRESS.reduce((said, [call, press]) => said.replace(call, press), one.text)}`)),
-      findings.length || said ? null : h("li", {}, "Nothing was found that keeps it from moving.")),
+      findings.length || said || pressed.length ? null : h("li", {}, "Nothing was found that keeps it from moving.")),
     h("form", { method: "dialog" }, h("button", {}, "Close")));
   $("findings").showModal();
 }
