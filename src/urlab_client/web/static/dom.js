@@ -37,6 +37,9 @@ export function number(value, digits = 3) {
   return (shown < 0 ? "−" : "\u2007") + Math.abs(shown).toFixed(digits);
 }
 
+/** An error without its code, which is for programs: `unknown_actor: no actor …`. */
+export const plain = (message) => message.replace(/^[a-z]+(_[a-z]+)+: /, "");
+
 export function duration(ms) {
   if (ms < 1000) return `${Math.max(0, Math.round(ms))} ms`;
   if (ms < 60000) return `${(ms / 1000).toFixed(1)} s`;

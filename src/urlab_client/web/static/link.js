@@ -1,6 +1,6 @@
 // The connection to the console: one WebSocket that reconnects by itself, and calls over HTTP.
 
-import { toast } from "./dom.js";
+import { plain, toast } from "./dom.js";
 
 const base = new URL(".", document.baseURI);
 const listeners = new Map();
@@ -101,7 +101,7 @@ export async function ask(method, path, body, { quiet = false, refused = () => f
   }
   const said = await answer.json().catch(() => ({}));
   if (answer.ok) return said;
-  if (!quiet && !refused(said.error)) toast([said.error?.message ?? answer.statusText, said.error?.hint].filter(Boolean).join(" "));
+  if (!quiet && !refused(said.error)) toast([plain(said.error?.message ?? answer.statusText), said.error?.hint].filter(Boolean).join(" "));
   return null;
 }
 

@@ -1,6 +1,6 @@
 // The log of calls, errors and events, in sentences; immediate repetitions are counted.
 
-import { $, h, heading, text } from "./dom.js";
+import { $, h, heading, plain, text } from "./dom.js";
 import { on } from "./link.js";
 
 const KEPT = 300;
@@ -90,7 +90,7 @@ function argumentsOf(entry) {
 /** An entry as a sentence: `set_sim_speed {"percent":50}` is `set the speed to 50 %`. */
 function words(entry, away) {
   if (entry.kind === "event") return EVENTS[entry.what]?.(entry.text, away) ?? `${entry.what.replaceAll("_", " ")}: ${entry.text}`;
-  if (entry.kind === "error") return (entry.who === "console" && TROUBLES[entry.what]) || `${entry.what.replaceAll("_", " ")}: ${entry.text}`;
+  if (entry.kind === "error") return (entry.who === "console" && TROUBLES[entry.what]) || `${entry.what.replaceAll("_", " ")}: ${plain(entry.text)}`;
   const given = argumentsOf(entry);
   if (CALLS[entry.what]) return CALLS[entry.what](given);
   const shown = typeof given === "string" ? given : Object.entries(given).filter(([, value]) => value !== null)
