@@ -180,3 +180,10 @@ def test_without_the_library_the_extra_is_named(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert main(["snapshot", "arm"]) == 2
     assert install_command("demo") in capsys.readouterr().err
+
+
+def test_without_pip_the_command_that_adds_an_extra_is_uv_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert " -m pip install " in install_command("demo")
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pip" else find(name))
+    assert install_command("demo").startswith("uv pip install --python ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,10 @@ async def test_a_grid(connect: Any, empty: Any, box: str) -> None:
     assert handles["g_2_1"].location == (4.0, 3.0, 1.0)
     with pytest.raises(TooManyCells):
         await client.scene.spawn_grid(blueprint, "h", 33, 32)
+    half = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # a quarter turn to the left
+    turned = await client.scene.spawn_grid(blueprint, "t", 1, 1, origin=(0, 9, 0), rotation_quat=half)
+    assert turned["t_0_0"].rotation_quat == pytest.approx(half, abs=1e-6)
+    await client.scene.destroy_actor("t_0_0")
     await client.sim.start()
     assert len(client.articulations) == 6
 

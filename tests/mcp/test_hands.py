@@ -114,6 +114,14 @@ async def test_a_wall_is_refused_and_what_cannot_be_pushed_is_told(
         await one.call("apply_scene", objects=[], remove=["heavy", "ground"])
 
 
+async def test_a_pose_with_a_word_that_is_none_of_its_fields_is_refused(server: SimulatedServer) -> None:
+    async with desk(server) as one:
+        before = await one.call("hand_pose", robot="arm")
+        said = await one.refused("follow", robot="arm", poses=[{"positon": [0.45, 0.15, 0.3], "gripper": 0.02}])
+        assert "unknown field `positon`" in said
+        assert (await one.call("hand_pose", robot="arm"))["position"] == before["position"]
+
+
 @pytest.mark.parametrize("mode", ["direct", "live"])
 async def test_a_weak_arm_is_corrected_until_its_hand_is_there(tmp_path: Path, mode: str) -> None:
     file = tmp_path / "sagging.xml"

@@ -414,3 +414,8 @@ def test_a_reply_with_a_state_is_a_snapshot() -> None:
     assert (told.sim_time, told.wall_time) == (clocks["sim_time"], clocks["wall_time"])
     assert told.entities == {}
     assert repr(told) == "<StateSnapshot step 0 at 0.000 s: no robots>"
+
+
+def test_what_has_no_form_as_plain_data_is_named() -> None:
+    with pytest.raises(TypeError, match="object has no form in plain data"):
+        plain_data({"a": [object()]}, "list")

@@ -142,7 +142,7 @@ class SceneObjects:
         if text("camera: name", name) in self.global_cameras:
             return self.global_cameras[name]
         owner, _, short = self.camera_name(name).rpartition("/")
-        return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]
+        return self.articulations[owner].cameras[short]
 
     def note_missing_frames(self, requested: Iterable[str], reply: StepOk) -> None:
         """Mark the cameras whose requested frame is missing, because the server omits it without an error."""
