@@ -210,8 +210,13 @@ def test_an_output_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFix
 def test_the_gentle_controller_stays_inside_the_control_ranges() -> None:
     with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:
         client.discover()
+        client.reset(per_articulation_qpos={"arm": {"elbow": 0.5}})
         arm = client.articulations["arm"]
         controller = Swing(arm)
+        controller.act(0.0)
+        elbow = arm.actuators["elbow"]
+        assert abs(elbow.value) > 0.1
+        assert elbow.value == pytest.approx(arm.joints["elbow"].position), "it begins where the robot is"
         seen = []
         for time in np.linspace(0, 5, 200):
             controller.act(time)

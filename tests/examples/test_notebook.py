@@ -99,6 +99,9 @@ def test_blocking_objects_show_tables(model: str) -> None:
         diagnosis = client.explain()
         assert "play" in html_of(diagnosis)
         assert "#2e7d32" in str(diagnosis._repr_html_()), "what is in order is green"
+        assert "play ready, waiting for step()" in html_of(client)
+        client.sim.stop()
+        assert "play not running, as far as this client knows" in html_of(client)
     assert "closed" in html_of(client)
     assert "step mode" not in html_of(client)
 

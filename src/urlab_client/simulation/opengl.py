@@ -117,7 +117,7 @@ def make_context(backend: Backend, width: int, height: int) -> Any:
     return context
 
 
-def free_context(context: Any, *, sound: bool = False) -> None:
+def free_context(context: Any, *, sound: bool) -> None:
     """Free a context, in the thread that uses it.
 
     Args:

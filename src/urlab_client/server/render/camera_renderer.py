@@ -264,7 +264,7 @@ class CameraRenderer:
         """Return width and height of all cameras by `ARTICULATION/CAMERA`."""
         return {key: camera.info.resolution for key, camera in self._by_name.items()}
 
-    def capture(self, shots: Iterable[Shot], frame_id: int = 0) -> Film:
+    def capture(self, shots: Iterable[Shot], frame_id: int) -> Film:
         """Copy the states that `frames` draws; the caller holds the engine's lock.
 
         Args:
