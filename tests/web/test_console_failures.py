@@ -266,7 +266,34 @@ async def test_a_moved_joint_leaves_the_set_points_of_a_controller_as_they_are(t
             await until(lambda: shown_targets(console, "quadruped") != [])
             assert shown_targets(console, "quadruped") == pytest.approx(wanted, abs=0.002)
             console.controls.set_points(ME, {"quadruped": {"FL_hip": 0.1}})
-            assert client.articulations["quadruped"].ctrl_array.tolist() == pytest.approx([0.1, *wanted[1:]], abs=0.002)
+            robot = client.articulations["quadruped"]
+            assert robot.ctrl_array.tolist() == pytest.approx([0.1, *wanted[1:]], abs=0.002)
+
+
+@pytest.mark.parametrize("mode", ["live", "direct"])
+async def test_after_a_reset_a_controller_keeps_the_pose_of_the_start(mode: str, tmp_path: Path) -> None:
+    pd = {"quadruped": ControllerConfig(kp=40.0, kv=1.5)}
+    with SimulatedServer("quadruped", play=True, unpaused=True, controllers=pd) as server:
+        async with connected(server, tmp_path, mode) as (client, console):
+            await until(lambda: shown_targets(console, "quadruped") != [])
+            console.controls.set_points(ME, {"quadruped": {"FL_thigh": 0.5}})
+            if mode == "direct":
+                await console.controls.step(ME, 100)
+            robot = client.articulations["quadruped"]
+            thigh = robot.joints["FL_thigh"]
+            await until(lambda: float(thigh.position) > 0.2)
+            reply = await console.controls.do(ME, Reset())
+            assert isinstance(reply, ResetOk)
+            start = float(reply.per_articulation["quadruped"].qpos[thigh.qpos_local_offset])
+            assert robot.actuators["FL_thigh"].value == pytest.approx(start, abs=0.002)
+            console.controls.set_points(ME, {"quadruped": {"FL_thigh": 0.5}})
+            if mode == "direct":
+                await console.controls.step(ME, 100)
+            await until(lambda: float(thigh.position) > 0.2)
+        async with connected(server, tmp_path, "live") as (client, console):  # a console that was started anew
+            await until(lambda: (shown_targets(console, "quadruped")[1:2] or [0.0])[0] > 0.4)
+            await console.controls.do(ME, Reset())
+            assert client.articulations["quadruped"].actuators["FL_thigh"].value == pytest.approx(start, abs=0.002)
 
 
 async def test_posing_takes_time_so_that_it_can_be_recorded(tmp_path: Path) -> None:

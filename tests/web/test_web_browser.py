@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from console_page import PATIENCE_S, PHONE, RUNNING, SLIDER, SOLID, Page, command, link_in, opened, serve
 from console_view import View
@@ -18,6 +19,8 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 from urlab_client.integrations.record import read_run
+
+FRAME = "document.querySelector('#view iframe')"
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]  # drawing without a graphics card takes its time
 
@@ -578,3 +581,27 @@ def test_a_killed_server_shows_as_such_and_comes_back(
     page.until(RUNNING)
     page.slide(0.4)
     page.until(page.elbow_is(0.4))
+
+
+def test_the_pointer_meets_in_the_3d_view_what_is_drawn_there(tmp_path: Path) -> None:
+    def drawn(seen: np.ndarray) -> tuple[int, int]:
+        """Return the rows of the arm in the middle column: it is white before a dark sky."""
+        rows = np.flatnonzero(seen[:, seen.shape[1] // 2].min(axis=1) > 140)
+        runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+        longest = max(runs, key=len)
+        return (int(longest[0]), int(longest[-1])) if len(longest) else (0, 0)
+
+    flags = (*SOLID, "--window-size=640,700")
+    with (
+        command("console", "sim://arm?play", "--port", "0") as (_, line),
+        opened(tmp_path, link_in(line), flags) as one,
+    ):
+        one.until("document.querySelector('#body')?.length > 1")
+        view = View(one)
+        view.until_the_arm_is_seen()
+        ray = f"{FRAME}.contentWindow.eval('(row) => viewerPointer.ray(innerWidth / 2, row)')"
+        rows = range(0, view.picture().shape[0], 4)
+        met = [row for row in rows if one.ask("api/pick", one.look(f"{ray}({row})"))["body"]]
+        assert len(met) > 4
+        ends = pytest.approx((met[0], met[-1]), abs=8)
+        view.until_picture(lambda seen: drawn(seen) == ends, f"the arm is not drawn from row {met[0]} to {met[-1]}")

@@ -63,6 +63,7 @@ SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is n
 _PERIOD_S = 1 / 60
 _MOST_STEPS = 200  # in one request, so that a viewer can stop them
 _DIGITS = 6
+_NOTICEABLE = 0.01  # difference of set-points that nobody takes for a rounding
 _FREQUENCY, _DAMPING = 40.0, 0.4
 """Frequency in rad/s and damping ratio of a joint that holds its pose."""
 
@@ -187,6 +188,8 @@ class Controls:
             art = self._client.articulations.get(key)
             if art is None or key in self.holding:
                 continue
+            # What a controller makes of the set-points from before may be in the state: it is to keep the pose instead.
+            start = start if art.controller is None else structs.replace(start, ctrl=None)  # noqa: PLW2901
             ours = key in self._driven or self._seeded.get(key) == art.ctrl_array.tolist()
             if not ours and not self._inherited(key, art, start):
                 continue
@@ -198,12 +201,12 @@ class Controls:
 
     def _inherited(self, key: str, art: URLabArticulation, start: ArticulationState) -> bool:
         """Return whether the server would apply set-points of an earlier client again after a reset in live mode."""
-        if art.controller is not None or art.control_owner is not None or art.ctrl_array.any():
-            return False
         before = None if self._view.snapshot is None else self._view.snapshot.per_articulation.get(key)
-        if self._client.step_mode is not StepMode.LIVE or before is None or before.ctrl is None or start.ctrl is None:
+        ours = art.control_owner is None and not art.ctrl_array.any()
+        if self._client.step_mode is not StepMode.LIVE or before is None or not ours:
             return False
-        return bool(np.any(np.asarray(before.ctrl) != np.asarray(start.ctrl)))
+        applied, first = applied_set_points(art, before), applied_set_points(art, start)
+        return applied is not None and first is not None and not np.allclose(applied, first, rtol=0.0, atol=_NOTICEABLE)
 
     def _forget(self, key: str) -> None:
         """Discard a robot's set-points."""

@@ -79,7 +79,7 @@ export class ActuatorRow {
   }
 
   write(value) {
-    if (document.activeElement !== this.box || performance.now() - this.held < HELD_MS) this.box.value = value.toFixed(digits(this.range));
+    if (document.activeElement !== this.box || performance.now() - this.held < HELD_MS) this.box.value = value.toFixed(digits(this.range)).replace(/^-(?=0\.?0*$)/, "");
   }
 
   draw(state) {

@@ -143,7 +143,7 @@ export class Chart {
     paint.strokeStyle = colors.grid;
     paint.lineWidth = 1;
     paint.textBaseline = "middle";
-    const across = ticks(middle - half, middle + half, 3);
+    const across = [3, 5, 8].map((count) => ticks(middle - half, middle + half, count)).find(({ found }) => found.length > 1);
     for (const value of across.found) {
       paint.textAlign = "right";
       paint.fillText(value.toFixed(across.digits).replace("-", "−"), PAD.left - 5, y(value));

@@ -28,7 +28,7 @@ class Robot {
       h("div", { class: "table joints" }, joints.map((joint) => this.joint(joint))));
     this.posing = false;
     this.element = h("section", { class: "card robot", "data-robot": art.key, "aria-label": art.key },
-      heading(art.key, h("span", { class: "tag" }, `${count(art.joints.length, "joint")} · ${count(art.actuators.length, "actuator")}`),
+      heading(art.key, h("span", { class: "tag", title: "Its name in the level" }, art.actor_id === art.key ? "" : art.actor_id), h("span", { class: "tag" }, `${count(art.joints.length, "joint")} · ${count(art.actuators.length, "actuator")}`),
         h("span", { class: "space" }), why),
       this.still, ...this.tables,
       this.joints,

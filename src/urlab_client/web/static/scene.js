@@ -206,7 +206,7 @@ export function makeContacts() {
         h("span", { class: "name" }, `${contact.geom1 || contact.body1} – ${contact.geom2 || contact.body2}`),
         h("span", { class: "num" }, `${number(contact.force[0], 1)} N`))));
       if (answer && !answer.n_contacts) list.replaceChildren(h("p", { class: "hint" }, "There are no contacts."));
-    }
+    } else if (box.open && now.status?.link.state === "taken_over") list.replaceChildren(h("p", { class: "hint" }, "Contacts are told to whoever has the session."));
     setTimeout(look, 400);
   };
   box.addEventListener("toggle", () => box.open && list.childElementCount === 0 && list.append(h("p", { class: "hint" }, "Looking …")));

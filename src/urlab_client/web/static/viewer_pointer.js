@@ -6,6 +6,7 @@
 const viewerPointer = (() => {
   const STATIC_BYTES = 8 * 1024 * 1024; // where a program keeps its static data
   const CLICK_PIXELS = 4;
+  const BAR = 32; // pixels below the picture, where MuJoCo's own bar is
   const TURN = 180; // degrees for a drag over the whole height
   const camera = { lookat: [0, 0, 0], distance: 3, azimuth: 90, elevation: -45 };
   const wanted = { select: -1, frames: false, contacts: false, pull: null };
@@ -71,14 +72,15 @@ const viewerPointer = (() => {
   }
   const sum = (...terms) => [0, 1, 2].map((i) => terms.reduce((total, [factor, vector]) => total + factor * vector[i], 0));
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const height = () => window.innerHeight - BAR;
   const half = () => Math.tan(((layout?.fovy ?? 45) * Math.PI) / 360);
   const origin = () => sum([1, camera.lookat], [-camera.distance, axes().forward]);
 
   /** The ray through a point of the picture. */
   function ray(x, y) {
     const { forward, right, up } = axes();
-    const v = (1 - (2 * y) / window.innerHeight) * half();
-    const u = ((2 * x) / window.innerWidth - 1) * half() * (window.innerWidth / window.innerHeight);
+    const v = (1 - (2 * y) / height()) * half();
+    const u = ((2 * x) / window.innerWidth - 1) * half() * (window.innerWidth / height());
     return { origin: origin(), direction: sum([1, forward], [u, right], [v, up]) };
   }
 
@@ -89,13 +91,13 @@ const viewerPointer = (() => {
   }
 
   function turn(dx, dy) {
-    camera.azimuth -= (dx / window.innerHeight) * TURN;
-    camera.elevation = Math.max(-89.9, Math.min(89.9, camera.elevation - (dy / window.innerHeight) * TURN));
+    camera.azimuth -= (dx / height()) * TURN;
+    camera.elevation = Math.max(-89.9, Math.min(89.9, camera.elevation - (dy / height()) * TURN));
   }
 
   function move(dx, dy) {
     const { right, up } = axes();
-    const scale = (2 * half() * camera.distance) / window.innerHeight;
+    const scale = (2 * half() * camera.distance) / height();
     camera.lookat = sum([1, camera.lookat], [-dx * scale, right], [dy * scale, up]);
   }
 
@@ -107,7 +109,7 @@ const viewerPointer = (() => {
   function key({ key: name, shiftKey, ctrlKey, metaKey, altKey }) {
     const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[name];
     if (!pointer.found || ctrlKey || metaKey || altKey || !(way || "+-=".includes(name))) return false;
-    const step = window.innerHeight / 24;
+    const step = height() / 24;
     if (!way) zoom(name === "-" ? 1.1 : 1 / 1.1);
     else if (shiftKey) move(step * way[0], step * way[1]);
     else turn(step * way[0], step * way[1]);
@@ -116,7 +118,7 @@ const viewerPointer = (() => {
 
   /** Show a sphere. */
   function fit({ center, radius }) {
-    const narrow = Math.atan(half() * Math.min(1, window.innerWidth / window.innerHeight));
+    const narrow = Math.atan(half() * Math.min(1, window.innerWidth / height()));
     Object.assign(camera, { lookat: [...center], distance: (1.05 * Math.max(radius, 0.05)) / Math.sin(narrow) });
   }
 
