@@ -141,6 +141,7 @@ BLACK = np.zeros((2, 2, 3), np.uint8)
         (refused(decode_json, b'{"Cameras": []}'), ValueError, "the list 'Frames' is missing"),
         (refused(decode_csv, b""), ValueError, "the table is empty"),
         (refused(decode_csv, b"time,hip\n1,2\n3\n"), ValueError, "row 3 has 1 cells, the header has 2"),
+        (refused(decode_csv, b"time,hip\n1,2\n3,nan\n"), ValueError, "row 3 contains a number that is not finite"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

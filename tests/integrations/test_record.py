@@ -139,6 +139,9 @@ def test_the_file_holds_to_the_bit_what_the_client_saw(client: urlab_client.URLa
     assert summary.about["step_mode"] == "direct"
     assert summary.topics["/state/arm"].messages == 120
     assert summary.topics["/state/arm"].rate_hz == pytest.approx(250)
+    with recorder.path.open("rb") as file:
+        numbers = [m.sequence for _, c, m in make_reader(file).iter_messages(topics=["/state/arm"])]
+    assert numbers == [*range(120)], "by which readers of MCAP find what is missing"
     assert math.isclose(summary.duration_s, 0.004 * 119)
     assert summary.wall_s == pytest.approx((table.wall_ns[-1] - table.wall_ns[0]) / 1e9)
     assert summary.wall_s > 0
