@@ -14,8 +14,8 @@ import urlab_client
 from urlab_client.aio import URLabClient
 from urlab_client.console.replay import recorded_handshake
 from urlab_client.console.session import ConsoleSession
-from urlab_client.integrations.record import read_run, record
-from urlab_client.server import SimulatedServer
+from urlab_client.integrations.record import RecordingError, read_run, record, recorder
+from urlab_client.server import ControllerConfig, SimulatedServer
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +61,36 @@ async def test_where_a_program_has_moved_it_to_it_stays(folder: Path) -> None:
             assert console.status(viewer).viewers == 1
             await until(lambda: len(console.view._watchers) == 0)  # nothing waits for viewers any more
         assert (console.replay.at, console.replay.rate) == (0.3, 0.0)
+
+
+async def test_set_points_of_a_controller_mean_what_they_did(tmp_path: Path) -> None:
+    file, pd = tmp_path / "pd.mcap", {"quadruped": ControllerConfig(kp=40.0, kv=1.5)}
+    with (
+        SimulatedServer("quadruped", play=True, controllers=pd) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        client.articulations["quadruped"].set_ctrl({"FL_thigh": 0.3})
+        with record(client, file):
+            client.step(n_steps=10)
+    async with console_of(file) as console:
+        (robot,) = console.view.world.articulations
+        assert {(one.takes, one.unit) for one in robot.actuators} == {("position", "rad")}
+        assert robot.controller is not None
+        assert robot.controller.params["kp"]["FL_thigh"] == 40.0
+
+
+def test_damaged_controllers_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder, "_about", lambda client: {"controllers": "[1]"})
+    with (
+        SimulatedServer("arm", play=True) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, tmp_path / "run.mcap"):
+            client.step()
+    with pytest.raises(RecordingError, match="the controllers in its metadata are damaged"):
+        recorded_handshake(read_run(tmp_path / "run.mcap"))
 
 
 async def test_it_opens_recordings_of_other_robots_too(folder: Path) -> None:

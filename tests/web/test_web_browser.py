@@ -456,6 +456,12 @@ def test_a_curve_that_is_added_has_a_past(page: Page) -> None:
     past = page.curve("arm/qpos/rad", "elbow")
     assert min(past) < 0.5 < max(past)
     page.click('[data-sensor="arm/qpos/rad"] .tiny')
+    page.choose("#add-curve", "arm/follows/elbow")
+    page.until("document.querySelector('[data-sensor=\"arm/follows/elbow\"]') !== null")
+    wanted, position = (page.curve("arm/follows/elbow", name) for name in ("set-point", "position"))
+    assert {0.0, 0.9} <= {*wanted}, "the set-point jumps"
+    assert any(0.1 < value < 0.8 for value in position), "and the joint follows"
+    page.click('[data-sensor="arm/follows/elbow"] .tiny')
     page.click("#play")
     page.until(RUNNING)
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import anyio
 import anyio.to_thread
+import msgspec
 import numpy as np
 from msgspec import Struct
 
@@ -26,10 +27,10 @@ from urlab_client.aio.model.mirror import require_local
 from urlab_client.console.messages import ReplayView
 from urlab_client.console.pictures import OF_SCENE, Cameras
 from urlab_client.console.shared_view import SharedView
-from urlab_client.enums import StepMode
+from urlab_client.enums import ControlMode, StepMode
 from urlab_client.errors import URLabError
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.messages.session import ArticulationInfo, CameraInfo, HelloOk
+from urlab_client.protocol.messages.session import ArticulationInfo, CameraInfo, ControllerInfo, HelloOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.names import NameMap, lasting_names, robot_prefixes
 
@@ -299,6 +300,7 @@ def recorded_handshake(run: Run) -> bytes:
     from urlab_client.integrations.record import RecordingError
 
     model, cameras = run.model(), {name: _camera(run, name) for name in run.cameras()}
+    controllers = _controllers(run)
     if not run.positions():
         raise RecordingError(f"{run.path}: the recording has no states of robots.")
     robots = [
@@ -306,6 +308,8 @@ def recorded_handshake(run: Run) -> bytes:
             prefix=key,
             actor_id=key,
             actor_name=prefix,
+            default_control_mode=ControlMode.UE_CONTROLLER if key in controllers else ControlMode.RAW,
+            controller=controllers.get(key),
             camera_topics={name: info for name, info in cameras.items() if name.startswith(f"{key}/")},
         )
         for key, prefix in run.prefixes().items()
@@ -321,6 +325,16 @@ def recorded_handshake(run: Run) -> bytes:
         global_cameras={name: info for name, info in cameras.items() if "/" not in name},
     )
     return encode_reply(hello)
+
+
+def _controllers(run: Run) -> dict[str, ControllerInfo]:
+    """Return the controllers of robots, as they were when the recording began; earlier releases wrote none."""
+    from urlab_client.integrations.record import RecordingError
+
+    try:
+        return msgspec.json.decode(run.summary().about.get("controllers", "{}"), type=dict[str, ControllerInfo])
+    except msgspec.MsgspecError as error:
+        raise RecordingError(f"{run.path}: the controllers in its metadata are damaged: {error}.") from None
 
 
 def _camera(run: Run, name: str) -> CameraInfo:

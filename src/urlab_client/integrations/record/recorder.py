@@ -12,10 +12,12 @@ from types import MappingProxyType
 from typing import Literal, get_args
 
 import anyio.to_thread
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
 from urlab_client.aio.arguments import finite_array
+from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.follower import Follower
@@ -24,8 +26,10 @@ from urlab_client.integrations._feed.samples import EpisodeMark
 from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour, opened
 from urlab_client.integrations._variation import wire_variation
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
+from urlab_client.protocol.messages.session import ControllerInfo
 from urlab_client.randomise.variation import declared_in
 from urlab_client.sync.client import URLabClient
+from urlab_client.values.names import lasting_names
 
 log: logging.Logger = logging.getLogger("urlab_client.record")
 
@@ -236,7 +240,7 @@ def record(
 
 
 def _about(client: AsyncClient) -> dict[str, str]:
-    """Return the metadata of a recording, with the randomisation of the server or of an environment."""
+    """Return the metadata of a recording: also robots' controllers, and the randomisation of server or environment."""
     model = client.model
     about = {
         "address": client.address,
@@ -245,6 +249,14 @@ def _about(client: AsyncClient) -> dict[str, str]:
         "mujoco_version": client.mujoco_version,
         "timestep": "" if model is None else repr(float(model.opt.timestep)),
     }
+    called = lasting_names(compiled_prefixes(client.articulations))  # as the topics are
+    controllers = {
+        called[key]: ControllerInfo(kind=str(one.kind), params=dict(one.params), schema=dict(one.schema))
+        for key, art in client.articulations.items()
+        if (one := art.controller) is not None
+    }
+    if controllers:
+        about["controllers"] = msgspec.json.encode(controllers).decode()
     declared = None if model is None else declared_in(model)
     if declared is None and (varied := wire_variation(client)) is not None:
         declared = varied.declaration

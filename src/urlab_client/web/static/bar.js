@@ -97,7 +97,7 @@ export function makeBar() {
   ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; anyone can (escape)", onclick: stop }, "■ Stop");
   ui.steps = h("input", { id: "steps", type: "number", min: 1, max: 10000, step: 1, required: true, value: 10, title: "Steps at a time", "aria-label": "Steps at a time" });
   ui.step = h("button", { id: "step", title: "Step, in direct mode (.)", onclick: step }, "Step");
-  ui.keyframe = h("select", { id: "keyframe", "aria-label": "Keyframe" }, h("option", { value: "" }, "start"));
+  ui.keyframe = h("select", { id: "keyframe", "aria-label": "Keyframe", title: "A keyframe puts a free base where its model says, wherever the robot stands in the level" }, h("option", { value: "" }, "start"));
   ui.reset = h("button", { id: "reset", title: "Reset to the start or a keyframe (r)", onclick: () => reset(ui.keyframe.value) }, "Reset to");
   ui.mode = h("select", { id: "mode", "aria-label": "Step mode", onchange: () => choose(ui.mode.value) },
     ...Object.entries(MODES).map(([mode, what]) => h("option", { title: what }, mode)));

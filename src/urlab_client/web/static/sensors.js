@@ -156,6 +156,11 @@ function sources(art) {
     found.push({ key: `${art.key}/ctrl`, title: forces ? "forces applied" : "controls applied", kind: "actuators", unit: forces ? "N m, N" : "",
       signals: art.actuators.map((actuator) => actuator.name), read: (state) => state.ctrl && art.actuators.map((actuator) => state.ctrl[actuator.index]) });
   }
+  for (const actuator of art.actuators) {
+    const joint = actuator.takes === "position" && art.joints.find((one) => one.name === actuator.joint && single(one));
+    if (joint) found.push({ key: `${art.key}/follows/${actuator.name}`, title: `${actuator.name}: set-point and position`, kind: "actuators", unit: joint.unit, signals: ["set-point", "position"],
+      read: (state) => state.targets && state.qpos ? [state.targets[actuator.index], state.qpos[joint.index]] : null });
+  }
   return found.map((source) => ({ ...source, art: art.key, signature: JSON.stringify([source.key, source.signals, source.unit]) }));
 }
 
