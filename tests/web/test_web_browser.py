@@ -150,6 +150,32 @@ def test_steps_and_reset_in_direct_mode(page: Page) -> None:
     page.until(RUNNING)
 
 
+def test_a_recording_of_nothing_leaves_no_file(page: Page) -> None:
+    page.until(RUNNING)
+    page.click("#stop")
+    page.asked("api/status", lambda status: not status["moving"])
+    files = page.ask("api/recordings")["recordings"]
+    for label in ("Stop", "Record"):
+        page.click("#record")
+        page.until(f"document.querySelector('#record').textContent.includes('{label}')")
+    page.until("document.querySelector('#toasts').innerText.includes('Nothing was recorded')")
+    assert page.ask("api/recordings")["recordings"] == files
+    page.click("#play")
+    page.until(RUNNING)
+
+
+def test_one_row_sets_the_gains_of_all_actuators(page: Page) -> None:
+    page.unfold("quadruped", "Gains")
+    one, other = (f"document.querySelector('[data-gain=\"kp/{name}\"]').value" for name in ("all", "RR_calf"))
+    page.until(f"{one} === '40'")
+    for value in ("35", "40"):
+        box = page.find("[data-gain='kp/all']")
+        box.send_keys(Keys.CONTROL, "a")
+        box.send_keys(value, Keys.ENTER)
+        page.until(f"{other} === '{value}'")
+    page.until("document.querySelector('#log').innerText.includes('set kp of quadruped: 40 for 12 actuators')")
+
+
 def test_gains_are_tuned_by_typing_and_the_next_box_keeps_the_focus(page: Page) -> None:
     def params() -> Any:
         robots = {art["key"]: art for art in page.ask("api/world")["articulations"]}

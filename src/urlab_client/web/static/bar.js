@@ -104,7 +104,7 @@ export function makeBar() {
   ui.source = h("select", { id: "source", "aria-label": "Whose set-points drive", title: "Whose set-points drive the robots: those of programs and this console, or those of the editor's panel",
     onchange: () => ui.source.value && op("set_control_source", { source: ui.source.value }) },
     h("option", { value: "", hidden: true }, "as it is"), h("option", { value: "zmq" }, "programs"), h("option", { value: "ui" }, "editor panel"));
-  ui.speed = h("input", { id: "speed", type: "range", min: 5, max: 100, step: 5, value: 100, "aria-label": "Speed, percent of real time",
+  ui.speed = h("input", { id: "speed", type: "range", min: 5, max: 100, step: 5, value: 100, "aria-label": "Speed, percent of real time", title: "How fast physics runs in live mode, percent of real time",
     onchange: () => op("set_sim_speed", { percent: +ui.speed.value }), oninput: () => text(ui.speedText, `${ui.speed.value} %`) });
   ui.speedText = h("span", { class: "num" }, "100 %");
   ui.who = h("span", {});

@@ -27,6 +27,12 @@ const TROUBLES = {
   "set-points": "Set-points did not reach the server.",
 };
 
+/** Values by name; of many that are the same, the value. */
+function alike(values) {
+  const [first, ...rest] = Object.values(values);
+  return rest.length > 2 && rest.every((value) => value === first) ? `${shortly(first)} for ${rest.length + 1} actuators` : shortly(values);
+}
+
 const each = (given, did, what) => Object.entries(given).map(([robot, names]) => `${did} ${names.length > 3 ? `${names.length} ${what}` : names.join(", ")} of ${robot}`).join("; ");
 
 /** What viewers do most, in words; `given` are the arguments. */
@@ -34,7 +40,7 @@ const CALLS = {
   set_paused: (given) => (given.paused ? "paused physics" : "let physics run"),
   run: () => "let physics run",
   step: (given) => `took ${given.n_steps} step${given.n_steps === 1 ? "" : "s"}`,
-  configure_controller: (given) => Object.entries(given.params).map(([gain, values]) => `set ${gain.replaceAll("_", " ")} of ${given.articulation}: ${shortly(values)}`).join("; "),
+  configure_controller: (given) => Object.entries(given.params).map(([gain, values]) => `set ${gain.replaceAll("_", " ")} of ${given.articulation}: ${alike(values)}`).join("; "),
   stop: () => "paused physics",
   reset: (given) => `reset the simulation${given.keyframe_name ? ` to ${given.keyframe_name}` : ""}`,
   set_mode: (given) => `chose step mode ${given.mode}`,

@@ -3,7 +3,7 @@
 import { $, confirmed, h, heading, number, text, toast } from "./dom.js";
 import { ask, on, upload } from "./link.js";
 
-const record = h("button", { id: "record", onclick: toggle }, "● Record");
+const record = h("button", { id: "record", title: "Record states, and pictures if chosen, into a file in the folder of the console", onclick: toggle }, "● Record");
 const cameras = h("input", { type: "checkbox", id: "record-cameras", checked: true });
 const progress = h("span", { class: "num", id: "record-progress" });
 const list = h("div", { class: "recordings", id: "recordings" });
@@ -35,7 +35,10 @@ async function toggle() {
   if (running) {
     const made = await ask("DELETE", "api/recording");
     if (made?.seconds) toast(`${made.name}: ${clockTime(made.seconds)}, ${bytes(made.bytes)}.`, "good");
-    else if (made) toast(`${made.name} is empty: no state came while it recorded. If physics stands still, press Play first.`);
+    else if (made && !made.robots.length) {
+      await ask("DELETE", at(made.name));
+      toast("Nothing was recorded: no state came meanwhile. If physics stands still, press Play first.");
+    }
     refresh();
   } else await ask("POST", "api/recording", { cameras: cameras.checked });
   record.disabled = false;

@@ -12,6 +12,7 @@ const GAINS = ["kp", "kv", "torque_limit"];
 class Robot {
   constructor(art) {
     this.key = art.key;
+    this.art = art;
     this.shape = shape(art);
     this.rows = [];
     this.boxes = [];
@@ -34,7 +35,6 @@ class Robot {
       this.joints,
       art.controller && GAINS.some((gain) => gain in art.controller.params) ? fold("Gains", false, this.gains(art)) : null,
       art.joints.some((joint) => joint.kind === "free") ? fold("Commanded twist", false, this.twist()) : null);
-    this.art = art;
   }
 
   /** Hold the home pose, or let go. A robot that has fallen is held before it is put back, or it would fall again. */
@@ -75,25 +75,32 @@ class Robot {
       h("span", { class: range ? "track bar" : "track" }, slider, range ? bar : h("small", {}, "no limits")), shown);
   }
 
+  /** A table of gains by actuator; its first row sets those of all. */
   gains(art) {
     const head = h("tr", {}, h("th", {}), ...GAINS.map((gain) => h("th", {}, gain.replace("_", " "))));
-    const rows = art.actuators.map((actuator) => h("tr", {}, h("th", {}, actuator.name), ...GAINS.map((gain) => {
-      const value = art.controller.params[gain]?.[actuator.name];
-      const box = h("input", { type: "number", min: 0, step: "any", value: value ?? "", "aria-label": `${gain} of ${actuator.name}`,
-        disabled: value === undefined, "data-gain": `${gain}/${actuator.name}` });
-      let known = box.value;
-      const take = (params) => {
-        known = String(params[gain]?.[actuator.name] ?? "");
-        if (document.activeElement !== box) box.value = known;
-      };
-      box.addEventListener("change", async () => {
-        const body = { articulation: this.key, params: { [gain]: { [actuator.name]: +box.value } } };
-        if (box.value === "" || (await op("configure_controller", body)) === null) box.value = known;
-      });
-      this.boxes.push(take);
-      return h("td", {}, box);
-    })));
-    return h("table", { class: "gains" }, head, ...rows);
+    const names = art.actuators.map((actuator) => actuator.name);
+    const row = (label, those) => h("tr", {}, h("th", {}, label), ...GAINS.map((gain) => h("td", {}, this.gain(gain, label, those.filter((name) => art.controller.params[gain]?.[name] !== undefined)))));
+    return h("table", { class: "gains" }, head, ...(names.length > 1 ? [row("all", names)] : []), ...names.map((name) => row(name, [name])));
+  }
+
+  /** A box with a gain of some actuators; empty while they differ. */
+  gain(gain, label, names) {
+    const common = (params) => {
+      const found = new Set(names.map((name) => params[gain]?.[name]));
+      return found.size === 1 ? String([...found][0] ?? "") : "";
+    };
+    const box = h("input", { type: "number", min: 0, step: "any", value: common(this.art.controller.params), "aria-label": `${gain} of ${label}`,
+      disabled: !names.length, "data-gain": `${gain}/${label}` });
+    let known = box.value;
+    this.boxes.push((params) => {
+      known = common(params);
+      if (document.activeElement !== box) box.value = known;
+    });
+    box.addEventListener("change", async () => {
+      const body = { articulation: this.key, params: { [gain]: Object.fromEntries(names.map((name) => [name, +box.value])) } };
+      if (box.value === "" || (await op("configure_controller", body)) === null) box.value = known;
+    });
+    return box;
   }
 
   twist() {

@@ -7,13 +7,13 @@ import { ask, on } from "./link.js";
 const SPANS = [2, 8, 30, 120];
 const AXES = { 3: ["x", "y", "z"], 4: ["w", "x", "y", "z"] };
 const KEPT_S = SPANS.at(-1);
-const span = h("select", { id: "span", "aria-label": "Seconds of the curves", onchange: () => {
+const span = h("select", { id: "span", "aria-label": "Seconds of the curves", title: "Seconds of the curves; drag over a curve to enlarge a part of it", onchange: () => {
   view.zoomed = null;
   charts.forEach((chart) => chart.touch());
   if (replay) fill();
 } },
   SPANS.map((seconds) => h("option", { value: seconds, selected: seconds === 8 }, `${seconds} s`)));
-const pause = h("button", { id: "pause-curves", "aria-pressed": "false", onclick: () => hold(!view.held) }, "❚❚ Hold");
+const pause = h("button", { id: "pause-curves", "aria-pressed": "false", title: "Hold the curves, to scroll back; physics runs on", onclick: () => hold(!view.held) }, "❚❚ Hold");
 const back = h("input", { type: "range", id: "scroll-back", min: 0, max: KEPT_S, step: "any", value: KEPT_S, "aria-label": "Scroll back", hidden: true,
   oninput: () => { view.end = view.last - (1 - back.value / KEPT_S) * Math.max(0, view.last - view.first - view.span); told(); } });
 const probe = h("i", { hidden: true });
