@@ -431,6 +431,7 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         )  # of its clock, like the length
         made = http.delete("/api/recording").json()
         assert made["seconds"] == pytest.approx(1.8, abs=0.01), "ten steps of 0.2 s, of which each is one state"
+        assert made["states"] == 10
         assert (made["robots"], made["damage"], made["lost"]) == (["arm"], "", 0)
         noted = [entry["text"] for entry in http.get("/api/log").json() if entry["what"] == "record"]
         assert noted[0] == name

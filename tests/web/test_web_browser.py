@@ -150,20 +150,6 @@ def test_steps_and_reset_in_direct_mode(page: Page) -> None:
     page.until(RUNNING)
 
 
-def test_a_recording_of_nothing_leaves_no_file(page: Page) -> None:
-    page.until(RUNNING)
-    page.click("#stop")
-    page.asked("api/status", lambda status: not status["moving"])
-    files = page.ask("api/recordings")["recordings"]
-    for label in ("Stop", "Record"):
-        page.click("#record")
-        page.until(f"document.querySelector('#record').textContent.includes('{label}')")
-    page.until("document.querySelector('#toasts').innerText.includes('Nothing was recorded')")
-    assert page.ask("api/recordings")["recordings"] == files
-    page.click("#play")
-    page.until(RUNNING)
-
-
 def test_one_row_sets_the_gains_of_all_actuators(page: Page) -> None:
     page.unfold("quadruped", "Gains")
     one, other = (f"document.querySelector('[data-gain=\"kp/{name}\"]').value" for name in ("all", "RR_calf"))

@@ -44,13 +44,14 @@ class RecordingView(Struct):
 
 
 class RecordingContents(RecordingView):
-    """A recording and what is in it: length in seconds, robots, cameras, and why the file is incomplete, if it is.
+    """A recording and what is in it: length in seconds, number of states, robots, cameras, and why it is incomplete.
 
     `lost` counts states and pictures that came too fast to be written. `unavailable` holds the formats that the
     recording cannot be converted to here, each with what is missing.
     """
 
     seconds: float
+    states: int
     robots: list[str]
     cameras: list[str]
     damage: str
@@ -217,6 +218,7 @@ def _described(file: Path, progress: Progress | None = None) -> RecordingContent
         bytes=file.stat().st_size,
         at=file.stat().st_mtime,
         seconds=round(summary.duration_s, 3),
+        states=max((topic.messages for name, topic in summary.topics.items() if name.startswith("/state/")), default=0),
         robots=[name.removeprefix("/state/") for name in summary.topics if name.startswith("/state/")],
         cameras=[name for name in cameras if not name.endswith("/calibration")],
         damage=summary.damage,

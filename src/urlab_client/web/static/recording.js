@@ -34,8 +34,8 @@ async function toggle() {
   record.disabled = true;
   if (running) {
     const made = await ask("DELETE", "api/recording");
-    if (made?.seconds) toast(`${made.name}: ${clockTime(made.seconds)}, ${bytes(made.bytes)}.`, "good");
-    else if (made && !made.robots.length) {
+    if (made?.states) toast(`${made.name}: ${clockTime(made.seconds)}, ${bytes(made.bytes)}.`, "good");
+    else if (made) {
       await ask("DELETE", at(made.name));
       toast("Nothing was recorded: no state came meanwhile. If physics stands still, press Play first.");
     }
