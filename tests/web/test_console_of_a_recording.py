@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from waiting import until
@@ -18,19 +19,24 @@ from urlab_client.integrations.record import RecordingError, read_run, record, r
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 
+def record_steps(file: Path, model: str, **server: Any) -> None:
+    """Record half a second of a simulation."""
+    with (
+        SimulatedServer(model, play=True, **server) as running,
+        urlab_client.URLabClient(**running.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, file):
+            for _ in range(26):
+                client.step(n_steps=10)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recordings of an arm and of a ball, each of half a second."""
     folder = tmp_path_factory.mktemp("recordings")
     for model in ("arm", "ball"):
-        with (
-            SimulatedServer(model, play=True) as server,
-            urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
-        ):
-            client.discover()
-            with record(client, folder / f"{model}.mcap"):
-                for _ in range(26):
-                    client.step(n_steps=10)
+        record_steps(folder / f"{model}.mcap", model)
     return folder
 
 
@@ -64,15 +70,8 @@ async def test_where_a_program_has_moved_it_to_it_stays(folder: Path) -> None:
 
 
 async def test_set_points_of_a_controller_mean_what_they_did(tmp_path: Path) -> None:
-    file, pd = tmp_path / "pd.mcap", {"quadruped": ControllerConfig(kp=40.0, kv=1.5)}
-    with (
-        SimulatedServer("quadruped", play=True, controllers=pd) as server,
-        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
-    ):
-        client.discover()
-        client.articulations["quadruped"].set_ctrl({"FL_thigh": 0.3})
-        with record(client, file):
-            client.step(n_steps=10)
+    file = tmp_path / "pd.mcap"
+    record_steps(file, "quadruped", controllers={"quadruped": ControllerConfig(kp=40.0, kv=1.5)})
     async with console_of(file) as console:
         (robot,) = console.view.world.articulations
         assert {(one.takes, one.unit) for one in robot.actuators} == {("position", "rad")}
@@ -82,13 +81,7 @@ async def test_set_points_of_a_controller_mean_what_they_did(tmp_path: Path) -> 
 
 def test_damaged_controllers_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder, "_about", lambda client: {"controllers": "[1]"})
-    with (
-        SimulatedServer("arm", play=True) as server,
-        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
-    ):
-        client.discover()
-        with record(client, tmp_path / "run.mcap"):
-            client.step()
+    record_steps(tmp_path / "run.mcap", "arm")
     with pytest.raises(RecordingError, match="the controllers in its metadata are damaged"):
         recorded_handshake(read_run(tmp_path / "run.mcap"))
 

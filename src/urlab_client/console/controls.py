@@ -15,7 +15,7 @@ from msgspec import Struct, structs
 from urlab_client.aio.controllers import URLabPDController
 from urlab_client.console.description import home_of
 from urlab_client.console.lease import DrivingLease, Viewer
-from urlab_client.console.messages import encode
+from urlab_client.console.messages import encode, rounded
 from urlab_client.console.pictures import Cameras
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
@@ -62,7 +62,6 @@ SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is n
 
 _PERIOD_S = 1 / 60
 _MOST_STEPS = 200  # in one request, so that a viewer can stop them
-_DIGITS = 6
 _NOTICEABLE = 0.01  # difference of set-points that nobody takes for a rounding
 _FREQUENCY, _DAMPING = 40.0, 0.4
 """Frequency in rad/s and damping ratio of a joint that holds its pose."""
@@ -395,7 +394,7 @@ def applied_set_points(art: URLabArticulation, state: ArticulationState) -> list
             position, velocity = state.qpos[joint.qpos_local_offset], state.qvel[joint.qvel_local_offset]
             damping = pd.kv.get(actuator.name, 0.0) * velocity
             values[at] = position + ((values[at] + damping) / kp if kp else 0.0)
-    return [round(value, _DIGITS) for value in values.tolist()]
+    return rounded(values)
 
 
 class _PoseHold:
