@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import re
 import signal
@@ -18,7 +19,7 @@ import pytest
 from http_served import served
 from starlette.applications import Starlette
 from starlette.routing import Route, WebSocketRoute
-from starlette.types import Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 from waiting import DEADLINE_S, eventually, until
 from websockets.asyncio.client import ClientConnection, connect
@@ -114,6 +115,31 @@ async def test_browsers_hear_why_a_stream_failed(caplog: pytest.LogCaptureFixtur
             assert "state_stream: no connection" in closed.value.rcvd.reason
             assert (await http.get("/events")).content == b""
     assert "Traceback" not in caplog.text
+
+
+async def test_a_browser_is_told_why_it_is_closed_while_items_are_sent() -> None:
+    told: list[Message] = []
+
+    async def send(message: Message) -> None:
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)  # as long as an item takes, and more
+        told.append(message)
+
+    async def numbers() -> AsyncGenerator[str]:
+        for number in itertools.count():
+            yield str(number)
+            await asyncio.sleep(0)
+
+    said: list[Message] = [{"type": "websocket.connect"}, {"type": "websocket.receive", "bytes": b"\0"}]
+
+    async def receive() -> Message:
+        await until(lambda: len(said) == 2 or len(told) > 10)
+        return said.pop(0)
+
+    socket = WebSocket({"type": "websocket"}, receive, send)
+    await socket.accept()
+    await forward(numbers(), socket)
+    assert told[-1] == {"type": "websocket.close", "code": 1003, "reason": "this socket takes text"}
 
 
 async def test_a_browser_that_acknowledges_nothing_waits_for_the_newest_state() -> None:

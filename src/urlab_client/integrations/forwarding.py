@@ -57,22 +57,13 @@ async def forward(items: Items, socket: WebSocket, *, ahead: int | None = None) 
                 await socket.send_text(item if isinstance(item, str) else item.to_json())
             await flow.until_free()
 
-    async def send_all() -> None:
-        try:
-            await send()
-        except URLabError as error:
-            log.warning("a WebSocket was closed: %s", error)
-            await socket.close(1011, str(error).encode()[:_REASON_BYTES].decode(errors="ignore"))
-        else:
-            await socket.close()
-
     async def listen() -> None:
         while True:
             await receive_text(socket)
             flow.acknowledge()
 
     async with contextlib.aclosing(items):
-        await converse(send_all, listen)
+        await converse(socket, send, listen)
 
 
 class EventStream(Response):
@@ -158,17 +149,36 @@ async def until_first(*jobs: Callable[[], Awaitable[None]]) -> None:
             tasks.start_soon(run, job)
 
 
-async def converse(send: Callable[[], Awaitable[None]], listen: Callable[[], Awaitable[None]]) -> None:
-    """Send and listen until either ends or the browser is gone, which each may find out first."""
+class _NoText(Exception):
+    """A browser sent bytes."""
 
-    def quietly(job: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
+
+async def converse(
+    socket: WebSocket, send: Callable[[], Awaitable[None]], listen: Callable[[], Awaitable[None]]
+) -> None:
+    """Send and listen until either ends or the browser is gone, which each may find out first; then close the socket.
+
+    Neither job may close it: the other one then fails, ends both, and the browser may never be told.
+    """
+    why: tuple[int, str | None] = (1000, None)
+
+    def explained(job: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
         async def run() -> None:
+            nonlocal why
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, perhaps during a reply
-                await job()
+                try:
+                    await job()
+                except URLabError as error:
+                    log.warning("a WebSocket was closed: %s", error)
+                    why = (1011, str(error).encode()[:_REASON_BYTES].decode(errors="ignore"))
+                except _NoText:
+                    why = (1003, "this socket takes text")
 
         return run
 
-    await until_first(quietly(send), quietly(listen))
+    await until_first(explained(send), explained(listen))
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone
+        await socket.close(*why)
 
 
 async def receive_text(socket: WebSocket) -> str:
@@ -178,8 +188,7 @@ async def receive_text(socket: WebSocket) -> str:
         raise WebSocketDisconnect(message["code"], message.get("reason"))
     text: str | None = message.get("text")
     if text is None:
-        await socket.close(1003, "this socket takes text")
-        raise WebSocketDisconnect(1003)
+        raise _NoText
     return text
 
 

@@ -82,7 +82,7 @@ async def live(console: ConsoleSession, socket: WebSocket) -> None:
                 except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
                     await _send(socket, Refused(explain_error(error)[1]))
 
-        await converse(send, listen)
+        await converse(socket, send, listen)
 
 
 def _obey(console: ConsoleSession, viewer: Viewer, message: Name | Ctrl | Hand) -> None:
@@ -137,7 +137,7 @@ async def poses(console: ConsoleSession, socket: WebSocket) -> None:
                     flow.acknowledge()
                     changed.set()
 
-        await converse(send, listen)
+        await converse(socket, send, listen)
 
 
 async def refuse_panels(_: ConsoleSession, socket: WebSocket) -> None:
