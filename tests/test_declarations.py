@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import logging
 import re
 from collections.abc import Iterator
 from functools import cache
@@ -149,3 +150,12 @@ def test_an_order_of_the_browser_that_says_nothing_asks_for_nothing() -> None:
         np.any(field.default) for field in fields if field.default is not msgspec.NODEFAULT and not field.required
     }
     assert numbers == {False}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_logger_is_one_of_ours(package: str) -> None:
+    """So that a program sets the level of all of them by the logger `urlab_client`."""
+    for module in modules(package):
+        for value in vars(module).values():
+            if isinstance(value, logging.Logger):
+                assert value.name.startswith("urlab_client"), module.__name__

@@ -212,6 +212,9 @@ async def test_regions_are_let_go_before_play_stops(
         await stream.receive()
         publishers.release_regions()
         await publisher.subscribed(STATE)
+        async with states(publishers) as another:
+            publisher.send(STATE, snapshot(1.5))
+            assert (await another.receive()).time == 1.5, "by socket, as play may have ended"
         publishers.refresh()
         await publisher.subscribed()
         state_region.publish(snapshot(2.0))

@@ -142,6 +142,19 @@ class Kept:
             fields[self.name] = self.value
 
 
+class EndedJobs:
+    """Knows no job of an earlier session."""
+
+    def __init__(self) -> None:
+        self._ended: bool = False
+
+    def __call__(self, request: Fields, reply: Fields) -> None:
+        if reply.get("op") in ("op_started", "hello_ok"):
+            self._ended = reply["op"] == "hello_ok"
+        elif self._ended and reply.get("op") == "op_status_ok":
+            reply.update(op="error", code="unknown_job", message="of an earlier session")
+
+
 class SameJob:
     """Gives every job that fails at once the number of the first."""
 

@@ -230,6 +230,10 @@ async def test_reset_sets_the_local_data_also_where_replies_do_not_show_it(
             assert client.data.act.tolist() == [activation]
             assert not client.data.qfrc_applied.any()
             assert not client.data.xfrc_applied.any()
+        (robot,) = client.articulations.values()
+        robot.ctrl_array[:] = 1.0
+        await client.step(10)
+        assert client.data.act.tolist() == pytest.approx([10 * client.model.opt.timestep])
         assert client.reset_seed is None
 
 

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 from falsifier import (
+    EndedJobs,
     Falsifier,
     Fields,
     Kept,
@@ -265,6 +266,11 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
         {"reply": in_reply("error:unknown_op", put("code", "bad_request"))},
     ),
     "a refusal without a message": (ANY, "Session 5.1", {"reply": in_reply("error:missing_op", drop("message"))}),
+    "a field that may be missing": (
+        ANY,
+        "Session 5.2",
+        {"reply": lambda request, reply: put("code", "busy")(reply) if request.get("op") == "set_paused" else None},
+    ),
     "an old session that goes on": (
         "beta",
         "Session 6",
@@ -370,6 +376,7 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
     "an unknown upload's code": ("beta", "Beta 61", {"reply": in_reply("error:unknown_upload", put("code", "busy"))}),
     "an upload that leads nowhere": ("beta", "Beta 62", {"reply": in_reply("upload_model_commit_ok", put("nq", 7.0))}),
     "a job's number": ("beta", "Generation 2 2", {"reply": SameJob()}),
+    "a job that ends with its session": ("beta", "Generation 2 8", {"reply": EndedJobs()}),
     "a rotation that is not one": (
         ANY,
         "Editor 2.2",

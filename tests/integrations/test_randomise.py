@@ -227,6 +227,10 @@ def test_a_server_varies_by_the_seed_of_a_reset_and_tells_of_the_scene_without()
         server.restore()
         client.discover()
         assert client.step(50).per_articulation["ball"].qpos[2] < 0.9, "from where the model has it, and falling freely"
+        for name, values in nominal.items():
+            assert np.array_equal(getattr(client.model, name), values), (
+                "and varied from there, not from the last episode"
+            )
 
 
 def test_late_lost_and_noisy_samples_are_seen_and_rewards_are_judged_without(made: list[Any]) -> None:

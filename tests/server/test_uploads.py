@@ -151,7 +151,8 @@ def test_chunks_that_are_refused(wire: Wire) -> None:
 
     assert refused(kind="mesh") == "bad_request"
     assert refused(offset=-1) == "bad_request"
-    assert refused(total=2**27) == "payload_too_large"
+    assert refused(total=2**26 + 1) == "payload_too_large"
+    assert refused(total=2**26) == "bad_request", "of another size than the manifest says"
     assert refused(data=b"") == "bad_request"
     assert refused(offset=1) == "bad_request"
     assert refused(upload_id="x") == "unknown_upload"

@@ -284,6 +284,10 @@ def test_a_hand_moves_for_a_moment_and_episodes_are_judged(http: TestClient, tmp
         assert last[:2] == pytest.approx(before[:2], abs=0.01)
         targets = heard(live, "state")["articulations"]["arm"]["targets"]
         assert targets[6] > 0.0
+        http.post("/api/ops/reset", json={}, headers=me)
+        home = at_rest(live)
+        live.send_json({**order, "linear": [0.0, 0.0, 1e-3]})
+        assert at_rest(live) == pytest.approx(home, abs=0.02), "from where it is, and not from where it was driven"
         for wrong, said in (
             ({"articulation": "leg"}, "leg"),
             ({"site": "toe"}, "no site 'toe'"),

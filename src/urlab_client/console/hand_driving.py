@@ -60,14 +60,12 @@ class HandDriving:
         began = time.monotonic()
         while True:
             if not self._orders:
-                self._moving.clear()
                 self._ordered.clear()
                 await self._ordered.wait()
                 began = time.monotonic()
             await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
             now = time.monotonic()
             passed, began = min(now - began, _LASTS_S), now
-            self._moving &= set(self._orders)
             for key, (at, viewer, order) in list(self._orders.items()):
                 if now - at > _LASTS_S:
                     del self._orders[key]
@@ -77,6 +75,7 @@ class HandDriving:
                 except (NotDriving, URLabError, ValueError, KeyError) as error:
                     del self._orders[key]
                     self._view.note("error", viewer.name, "hand", str(error))
+            self._moving &= set(self._orders)
 
     def _drive(self, viewer: Viewer, order: Hand, seconds: float) -> None:
         self._lease.use(viewer)  # before anything is written, as another viewer may drive by now
