@@ -184,6 +184,7 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
         "Session 9.4",
         {"reply": in_state(each("qvel", lambda v: [x + 0.5 for x in v]), "reset_ok")},
     ),
+    "a reset that counts on": (ANY, "Session 9.4", {"reply": in_reply("reset_ok", put("step", 10.0))}),
     "a keyframe that is taken for another": (
         ANY,
         "Session 9.4",
