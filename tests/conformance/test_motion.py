@@ -230,13 +230,13 @@ async def test_joints_go_where_they_are_sent(moving: Any) -> None:
 async def test_joints_that_do_not_arrive_are_named(connect: Any, server: Any) -> None:
     client = await described(connect, server)
     (art,) = client.articulations.values()
+    with pytest.raises(NotSettled, match="Still moving: 'knee'"):
+        await art.move_to({"knee": 0.05}, timeout=0.02)
+    assert 0.1 < art.joints["knee"].velocity < 0.8
     with pytest.raises(NotSettled, match=r"'knee' is .* rad away") as caught:
         await art.move_to({"knee": 1.0}, timeout=0.02)
     assert caught.value.remaining == {"knee": pytest.approx(1.0 - art.joints["knee"].position)}
     assert "Still moving: 'knee'" in str(caught.value)
-    with pytest.raises(NotSettled, match="Still moving: 'slider'"):
-        await art.move_to({"slider": -0.05}, timeout=0.02)
-    assert 0.1 < abs(art.joints["slider"].velocity) < 1.0
 
 
 @pytest.mark.parametrize(
