@@ -10,9 +10,8 @@ from __future__ import annotations
 import base64
 import math
 import re
-import struct
 from _thread import allocate_lock
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, TypeVar, cast
@@ -36,8 +35,6 @@ _COPY_SUFFIX = "_base64"  # a second copy of a binary field; see `HelloOk.mjb_ba
 
 R = TypeVar("R", bound=Reply)
 Buffer = bytes | bytearray | memoryview
-
-_SHORT = 256  # values of a robot, not pixels
 
 # `_thread` instead of `threading`: this module starts no threads, but is called from several.
 _BUILDING = allocate_lock()
@@ -67,27 +64,10 @@ def op_of(request: Request[Any] | type[Request[Any]]) -> Op:
     return _OP_BY_REQUEST[request if isinstance(request, type) else type(request)]
 
 
-@cache
-def _packer(count: int) -> Callable[..., None]:
-    return struct.Struct(f"{count}d").pack_into
-
-
 def from_wire_array(kind: type, value: Any) -> Any:
     """Decoding hook: a list of numbers becomes a float64 array of shape (n,)."""
-    if type(value) is list:
-        numbers: list[Any] = value  # pyright: ignore[reportUnknownVariableType]  # `cast` is a call, for each array
-        count = len(numbers)
-        if count <= _SHORT:
-            # Twice as fast as the code below, but only for numbers; everything else falls through.
-            packed = np.empty(count)
-            try:
-                _packer(count)(packed, 0, *numbers)
-            except (struct.error, OverflowError):
-                pass
-            else:
-                return packed
     try:
-        array: np.ndarray[Any, np.dtype[np.float64]] = np.array(value, dtype=np.float64)
+        array = np.array(value, float)
     except OverflowError as error:  # integers have no limit in JSON; msgspec expects ValueError
         raise ValueError(str(error)) from None
     if array.ndim != 1:
