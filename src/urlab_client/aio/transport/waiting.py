@@ -369,7 +369,7 @@ class BusyPoll:
 
     def pays(self, op: str) -> bool:
         """Return whether to poll for the reply to this op."""
-        return not _polling and not crowded() and self._ops[op].awake
+        return self._ops[op].awake and not _polling and not crowded()
 
     async def look(self, op: str, reply: asyncio.Future[Any], look: Callable[[], object]) -> None:
         """Call `look` until it completes `reply` or the time limit is reached. Other tasks run between two calls."""
