@@ -126,11 +126,6 @@ class Features(Serializable, Struct, frozen=True, kw_only=True, dict=True):
         return not self._beta_state
 
     @cached_property
-    def level_sticks(self) -> bool:
-        """The observation level of a step holds for later steps, too."""
-        return not self._beta_state
-
-    @cached_property
     def exact_controls(self) -> bool:
         """Set-points and what controllers make of them are not rounded to single precision."""
         return self._beta_state

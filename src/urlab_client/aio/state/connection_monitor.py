@@ -276,7 +276,7 @@ class SessionKeeper:
                 async with session.turn(Hello) as turn:
                     if session.session_id == lost:
                         log.info("discovering again, because %s", why)
-                        await self._discovery.open(turn, state.level.of_session)
+                        await self._discovery.open(turn, state.level)
             except (URLabConnectionError, URLabTimeoutError) as error:
                 if isinstance(error, ClientClosed):
                     raise

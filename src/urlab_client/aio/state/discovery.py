@@ -48,7 +48,7 @@ class Discovery:
         state = self._state
         state.pending.handshake = True  # until it has been adopted
         hello = await state.session.hello(turn, Hello(observations=observations))
-        state.level.open(observations)
+        state.level, state.level_to_restore = observations, None
         await self.adopt(turn, hello)
         return hello
 
@@ -93,8 +93,8 @@ class Discovery:
 
     async def _hello_with_assets(self, turn: Turn) -> HelloOk:
         state = self._state
-        hello = await state.session.hello(turn, Hello(observations=state.level.of_session, include_assets=True))
-        state.level.open(state.level.of_session)
+        hello = await state.session.hello(turn, Hello(observations=state.level, include_assets=True))
+        state.level_to_restore = None
         return hello
 
     async def _without_binary(self, turn: Turn, hello: HelloOk) -> HelloOk:

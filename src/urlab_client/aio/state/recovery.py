@@ -62,7 +62,7 @@ async def _resync(
     # Without a handshake, or if one was interrupted, the client may know another world than the one that plays.
     if renewed or pending.play or pending.handshake or state.hello is None:
         renewed = True
-        await discovery.open(turn, state.level.of_session)
+        await discovery.open(turn, state.level)
         reply = await read_state(turn)
         if before is not None and reply is not None and applied is not None and reply.time != before.time:
             applied = _with_late_steps(state, applied, reply.time - before.time)

@@ -53,27 +53,6 @@ _Parts = tuple[
 """The parts of a checked state, each with its target."""
 
 
-class ReplyLevel:
-    """Observation level of the replies to steps.
-
-    Attributes:
-        of_session: Level of the session.
-        in_force: Level in the server, which an earlier step may have changed; empty if unknown.
-    """
-
-    def __init__(self) -> None:
-        self.of_session: str = "standard"
-        self.in_force: str = "standard"
-
-    def open(self, level: str) -> None:
-        """Note the level that a handshake has set."""
-        self.of_session = self.in_force = level
-
-    def forget(self) -> None:
-        """Note that the level in the server is unknown."""
-        self.in_force = ""
-
-
 class SimState:
     """State from `discover()` and the replies after it.
 
@@ -81,6 +60,8 @@ class SimState:
         objects: Articulations, entities and cameras.
         recording: Whether this client has started a recording that nothing has ended since.
         hello: The last handshake, without the model's bytes.
+        level: Observation level of the session.
+        level_to_restore: The same if the server may have another level in force, so that the next step names it.
         located: Whether the state is known exactly: a reply or snapshot has brought it since the last handshake.
         reset_seed: Seed of the last reset, or None without one.
         user: Values of the scene's user channels.
@@ -99,7 +80,8 @@ class SimState:
         self.objects: SceneObjects = SceneObjects(session, publishers, self.mirror)
         self.mode: ModeState = ModeState(session, wanted_mode, self._receive_live)
         self.clocks: Clocks = Clocks()
-        self.level: ReplyLevel = ReplyLevel()
+        self.level: str = "standard"
+        self.level_to_restore: str | None = None
         self.pending: PendingOutcomes = PendingOutcomes()
         self.recording: bool = False
         self.hello: HelloOk | None = None
@@ -182,7 +164,7 @@ class SimState:
         """Handle a new session, possibly from a handshake that its caller had abandoned."""
         self.pending.clear()  # the server rejects requests of the previous session
         self.clocks.step_count = 0
-        self.level.forget()
+        self.level_to_restore = self.level
         self.publishers.events.publish(
             SessionOpened(
                 session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version

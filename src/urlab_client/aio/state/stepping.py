@@ -26,38 +26,38 @@ Cameras = bool | Mapping[str, "str | CameraTiming"]
 async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras, asked: str | None) -> StepOk:
     """Advance physics according to the step mode and apply the new state."""
     state.require_handshake("step")
-    session, levels, modes = state.session, state.level, state.mode
+    session, modes = state.session, state.mode
     if modes.unsettled is not None or modes.pause_unsettled:
         await modes.settle(turn)
     mode = modes.current
-    if n_steps < (0 if mode is StepMode.PUPPET else 1):
+    puppet, assumed = mode is StepMode.PUPPET, modes.assumed
+    if n_steps < (0 if puppet else 1):
         raise ValueError(_too_few(n_steps, mode))
     pictures = await _pictures(state, turn, cameras, n_steps) if state.observers or cameras is not False else None
-    if mode is StepMode.LIVE and not modes.assumed:
+    if mode is StepMode.LIVE and not assumed:
         return await _live_step(state, turn, pictures)
-    request, wrenches = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
+    request, wrenches = _puppet_step(state, n_steps) if puppet else _direct_step(state, n_steps)
     if pictures is not None:
         pictures.ask(request)
-    assumed, before, sent_in = modes.assumed, state.clocks.step_count, session.session_id
-    began = state.clocks.sim_time
-    level = asked or levels.of_session
-    request.observations = None if level == levels.in_force else level
-    levels.forget()  # until the reply arrives
+    before, began, sent_in = state.clocks.step_count, state.clocks.sim_time, session.session_id
+    request.observations = asked or state.level_to_restore
+    # On some servers, the level of a step holds for later ones, too.
+    state.level_to_restore = request.observations and state.level
     try:
         reply = await turn.call(request, takes=None if pictures is None else _seconds(pictures))
-        if session.session_id == sent_in:  # otherwise an abandoned handshake set the level
-            levels.in_force = level if session.features.level_sticks else levels.of_session
+        if asked is None and session.session_id == sent_in:  # otherwise an abandoned handshake set the level
+            state.level_to_restore = None
         if pictures is not None:
             await pictures.complete(turn, reply)
-        state.absorb(reply, "step", into_mirror=mode is not StepMode.PUPPET)
+        state.absorb(reply, "step", into_mirror=not puppet)
     except BaseException as error:
-        _note_failure(state, turn, error, 1 if mode is StepMode.PUPPET else n_steps, wrenches)
+        _note_failure(state, turn, error, 1 if puppet else n_steps, wrenches)
         raise
-    _settle(state, reply, None if assumed or mode is not StepMode.DIRECT else began)
+    _settle(state, reply, None if puppet or assumed else began)
     if assumed:
         # If an abandoned handshake was answered meanwhile, the server's counter started anew.
         _learn_mode(state, request, reply, reply.step - (before if session.session_id == sent_in else 0))
-        if modes.puppet and mode is not StepMode.PUPPET and not (pictures and pictures.interruption):
+        if modes.puppet and not puppet and not (pictures and pictures.interruption):
             return await take_steps(state, turn, n_steps, cameras, asked)  # the request has only set the clock
     if modes.current is StepMode.PUPPET:
         with state.mirror.lock:
@@ -159,7 +159,7 @@ def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) ->
     expected = state.mode.current
     if advanced == 0:
         state.mode.note(StepMode.LIVE)
-        state.level.forget()  # the server ignores the level in this mode
+        state.level_to_restore = state.level  # the server ignores the level in this mode
     elif advanced == 1 and reply.time == request.time and state.mirror.model is not None:
         state.mode.note(StepMode.PUPPET)
     elif advanced == request.n_steps:
