@@ -35,7 +35,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from urlab_client.aio.background import background_thread
-from urlab_client.errors import ClientClosed
+from urlab_client.errors import ClientClosed, URLabError
 from urlab_client.sync._signals import DeferredSignals
 
 T = TypeVar("T")
@@ -73,6 +73,14 @@ _log = logging.getLogger("urlab_client.sync")
 def client_closed(when: str = "before this call") -> ClientClosed:
     """Return the error of a call to a client that was closed."""
     return ClientClosed(f"The client was closed {when}.", hint="Create a new one.")
+
+
+def on_io_thread() -> URLabError:
+    """Return the error of a call from inside the loop."""
+    return URLabError(
+        "A blocking call was made on the client's own I/O thread, which would wait for itself.",
+        hint="Move the work to another thread, or use urlab_client.aio in code that runs on the event loop.",
+    )
 
 
 class _Selector(selectors.DefaultSelector):
@@ -183,6 +191,7 @@ class CallerDrivenLoop:
         """Run `job` until it is finished, and run the handlers of signals that arrive in the meantime.
 
         Raises:
+            URLabError: The caller runs inside the loop.
             ClientClosed: The loop is stopping.
             BaseException: A signal handler raised it. The job was cancelled and had `GRACE` seconds to clean up.
         """
@@ -218,7 +227,10 @@ class CallerDrivenLoop:
 
     def _begin(self, job: Job[Any]) -> bool:
         """Register `job`, and queue it unless its caller is to run the loop; return whether it is."""
-        drives = asyncio._get_running_loop() is None  # noqa: SLF001  # unlike get_running_loop, never raises
+        running = asyncio._get_running_loop()  # noqa: SLF001  # unlike get_running_loop, never raises
+        if running is self._loop:
+            raise on_io_thread()
+        drives = running is None
         if not _MAIN_THREAD_DRIVES:
             drives = drives and threading.current_thread() is not threading.main_thread()
         with self._lock:

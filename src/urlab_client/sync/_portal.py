@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
 from urlab_client.protocol.messages.streams import StreamItem
-from urlab_client.sync._loop import CallerDrivenLoop, Job, client_closed
+from urlab_client.sync._loop import CallerDrivenLoop, Job, client_closed, on_io_thread
 from urlab_client.sync._signals import DeferredSignals
 
 P = ParamSpec("P")
@@ -116,7 +116,7 @@ class Portal:
         if self._closed or os.getpid() != self._pid:
             return
         if self._io is not None and self._io.is_current:
-            raise _on_io_thread()
+            raise on_io_thread()
         with DeferredSignals():
             try:
                 if last is not None:
@@ -153,8 +153,6 @@ class Portal:
                     io.start()
                     self._finalizer = weakref.finalize(self, io.stop)
                     self._io = io
-        elif self._io.is_current:
-            raise _on_io_thread()
         return self._io
 
 
@@ -178,11 +176,4 @@ def _forked() -> ForkedError:
     return ForkedError(
         "This client was created before the process forked. Its thread and sockets belong to the parent.",
         hint="Create a client in the child, or start workers with multiprocessing's 'spawn' method.",
-    )
-
-
-def _on_io_thread() -> URLabError:
-    return URLabError(
-        "A blocking call was made on the client's own I/O thread, which would wait for itself.",
-        hint="Move the work to another thread, or use urlab_client.aio in code that runs on the event loop.",
     )

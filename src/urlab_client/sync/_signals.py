@@ -38,15 +38,14 @@ class DeferredSignals:
         on_arrival: Callback invoked when a signal arrives, between any two instructions of the block. Must not raise.
     """
 
-    __slots__ = ("_handlers", "_holding", "_numbers", "arrived", "on_arrival")
+    __slots__ = ("_handlers", "_holding", "arrived", "on_arrival")
 
     _known: ClassVar[tuple[list[Any], list[int]]] = [], []  # what was installed at the last call, and which to defer
 
     def __init__(self) -> None:
         self.on_arrival: Callable[[], object] | None = None
         self._holding = False
-        self._numbers: list[int] = []
-        self._handlers: list[Any] = []
+        self._handlers: dict[int, Any] = {}  # those that were replaced
         self.arrived: list[tuple[int, FrameType | None]] = []
 
     def __enter__(self) -> Self:
@@ -58,11 +57,10 @@ class DeferredSignals:
             if installed != known:
                 numbers = [number for number, handler in zip(SIGNALS, installed, strict=True) if _is_deferred(handler)]
                 DeferredSignals._known = installed, numbers
-            self._numbers = numbers
             try:
-                # One C call replaces all of them, and after an exception the list contains exactly those that were
+                # One C call replaces all of them, and after an exception the map contains exactly those that were
                 # replaced. In a Python loop, a handler still in place could raise between replacing one and noting it.
-                self._handlers.extend(map(_set_handler, numbers, repeat(self._on_signal)))
+                self._handlers.update(zip(numbers, map(_set_handler, numbers, repeat(self._on_signal)), strict=False))
                 self._holding = True
             except BaseException:  # raised by a handler that was not replaced yet
                 self._holding = True
@@ -101,8 +99,8 @@ class DeferredSignals:
         `_on_signal`.
         """
         mine = self._on_signal
-        restored = [*zip(self._numbers, self._handlers, strict=False)]
-        restored = [pair for pair in restored if _get_handler(pair[0]) == mine]  # others were replaced in the meantime
+        # Others were replaced in the meantime.
+        restored = [pair for pair in self._handlers.items() if _get_handler(pair[0]) == mine]
         undelivered = map(_raise_soon, map(itemgetter(0), self.arrived))  # those that are still to come included
         try:
             _consume(starmap(_set_handler, restored))
@@ -117,7 +115,7 @@ class DeferredSignals:
 
     def _replaced(self, number: int) -> Any:
         """Return the handler that was replaced, by this block or an outer one."""
-        handler = dict(zip(self._numbers, self._handlers, strict=False)).get(number)
+        handler = self._handlers.get(number)
         outer = getattr(handler, "__self__", None)
         return outer._replaced(number) if isinstance(outer, DeferredSignals) else handler  # noqa: SLF001  # our own
 
