@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
+from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Generator
 from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
 from typing import Any, Final, TypeVar
@@ -43,6 +43,7 @@ from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateRe
 log: logging.Logger = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)
+_Ask = Callable[[bytes, Op, Deadlines], Awaitable[bytes]]
 _HELLO = op_of(Hello)
 _COMPOSING: ContextVar[Session | None] = ContextVar("_COMPOSING", default=None)
 """Session whose scene the running task changes by several ops."""
@@ -322,10 +323,11 @@ class Session:
                 check_request(request, frame)
         began = time.perf_counter()
         try:
+            ask = self._greet if op is _HELLO else self._way.request
             try:
-                answer = await self._ask(frame, op, deadlines)
+                answer = await ask(frame, op, deadlines)
             except ConnectionLost as lost:
-                answer = await self._ask_again(frame, op, lost, deadlines)
+                answer = await _ask_again(ask, frame, op, deadlines, lost)
             if log.isEnabledFor(logging.DEBUG):
                 took = 1e3 * (time.perf_counter() - began)
                 log.debug("%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), took)
@@ -407,28 +409,14 @@ class Session:
             self._adopt_abandoned_hello(reply)
         return self._abandoned_hello is None
 
-    def _ask(self, frame: bytes, op: Op, deadlines: Deadlines) -> Coroutine[Any, Any, bytes]:
-        return self._greet(frame, deadlines) if op is _HELLO else self._way.request(frame, op, deadlines)
-
-    async def _greet(self, frame: bytes, deadlines: Deadlines) -> bytes:
+    async def _greet(self, frame: bytes, op: Op, deadlines: Deadlines) -> bytes:
         """Send a handshake, which opens a session even if its caller gives up."""
         sent = self.transport.stats.sent
         try:
-            return await self._way.request(frame, _HELLO, deadlines, late=self._adopt_later)
+            return await self._way.request(frame, op, deadlines, late=self._adopt_later)
         finally:
             if self.transport.stats.sent > sent:
                 self.hello_sent = self._hello_unanswered = True  # `_hello_unanswered` until the reply has been read
-
-    async def _ask_again(self, frame: bytes, op: Op, lost: ConnectionLost, deadlines: Deadlines) -> bytes:
-        """Repeat an idempotent request whose connection broke, until it is answered or its deadline has passed."""
-        while True:
-            log.debug("%s: sending the request again, because the connection was lost", op.name)
-            try:
-                return await self._ask(frame, op, deadlines)
-            except ConnectionLost as again:
-                lost = again
-            except ServerUnreachable as unreachable:
-                raise lost from unreachable
 
     async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None:
         """Wait for one of the session's locks.
@@ -456,6 +444,18 @@ class Session:
             ) from None
         finally:
             self._queued -= 1
+
+
+async def _ask_again(ask: _Ask, frame: bytes, op: Op, deadlines: Deadlines, lost: ConnectionLost) -> bytes:
+    """Repeat an idempotent request whose connection broke, until it is answered or its deadline has passed."""
+    while True:
+        log.debug("%s: sending the request again, because the connection was lost", op.name)
+        try:
+            return await ask(frame, op, deadlines)
+        except ConnectionLost as again:
+            lost = again
+        except ServerUnreachable as unreachable:
+            raise lost from unreachable
 
 
 def leaves_open(error: BaseException) -> bool:

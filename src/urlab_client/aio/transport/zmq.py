@@ -69,7 +69,7 @@ class _Open(NamedTuple):
 
 
 class ZmqTransport:
-    """Sends requests and returns their replies. Use from one event loop.
+    """Sends requests and returns their replies. Use from one event loop, which the session checks.
 
     It has one DEALER socket, connects on first use and reconnects automatically.
 
@@ -134,10 +134,7 @@ class ZmqTransport:
             OutcomeUnknown: The connection broke after sending; the op may have been executed.
             ClientClosed: The client was closed.
         """
-        opened = self._open
-        if opened is None or asyncio._get_running_loop() is not opened.loop:  # noqa: SLF001
-            opened = self._connect()
-        loop, _, _, replies, send, get = opened
+        loop, _, _, replies, send, get = self._open or self._connect()
         deadline = deadlines.reply
         while True:
             if not self.connected:
@@ -227,7 +224,7 @@ class ZmqTransport:
     def _connect(self) -> _Open:
         if self._closed:
             raise self._was_closed()
-        loop = running_loop(None if self._open is None else self._open.loop)
+        loop = running_loop()
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
         socket.maxmsgsize = MAX_REPLY_BYTES  # rejected by its header, before it uses memory
@@ -321,10 +318,10 @@ class ZmqTransport:
 
     def _take(self) -> None:
         """Receive replies until no request waits for one."""
-        if self._open is None:  # it has been closed
+        opened = self._open
+        if opened is None:  # it has been closed
             return
-        loop, _, connection, _, _, get = self._open
-        receive = connection.socket.recv
+        receive = opened.connection.socket.recv
         while True:
             try:
                 key = receive(_NOBLOCK)
@@ -333,13 +330,13 @@ class ZmqTransport:
             except zmq.Again:
                 return
             if delimiter or last.more:
-                while get(_RCVMORE):
+                while opened.get(_RCVMORE):
                     receive(_NOBLOCK)
                 self._drop_stray()
                 continue
             if (silent := self._silent_since) is not None:
                 self._silent_since = None
-                self._tell(ServerAnswers(endpoint=self.endpoint, silent_s=loop.time() - silent))
+                self._tell(ServerAnswers(endpoint=self.endpoint, silent_s=opened.loop.time() - silent))
             if self._abandoned and key >= self._abandoned:
                 self._abandoned = b""  # the server answers the requests of a connection in their order
             if self._late is not None and key > self._late[0]:
