@@ -127,6 +127,7 @@ class Mirror:
         model: The compiled model, or None without one.
         data: State that mirrors the server's, or None without a model.
         prefixes: What the compiled names of each articulation's elements begin with, by key.
+        stale: True if positions or velocities changed, so that derived quantities must be computed before use.
         approximate: True if this client compiled the model from XML because the server runs another MuJoCo build
             or is not trusted with binary models.
     """
@@ -137,7 +138,7 @@ class Mirror:
         self.data: mujoco.MjData | None = None
         self.prefixes: NameMap[str] = NameMap(kind="articulation")
         self.approximate: bool = False
-        self._stale = False
+        self.stale: bool = False
         self._dragged: int | None = None
 
     @staticmethod
@@ -210,7 +211,7 @@ class Mirror:
             mujoco.mj_getState(self.model, self.data, state, kept)
             mujoco.mj_setState(loaded.model, loaded.data, state, kept)
         self.model, self.data, self.approximate = (None, None, False) if loaded is None else loaded
-        self._stale = keep
+        self.stale = keep
         self._dragged = None
 
     def holds(self, loaded: Loaded | None) -> bool:
@@ -263,13 +264,9 @@ class Mirror:
                 owner = f" of {_owner(model, what, i)}" if what != "ctrl" else ""
                 raise ValueError(f"step: data.{what}[{i}]{owner} is {array[i]}. Nothing was sent.")
 
-    def mark_stale(self) -> None:
-        """Note that positions or velocities changed, so that derived quantities must be computed before use."""
-        self._stale = True
-
     def current_data(self) -> mujoco.MjData | None:
         """Return the data with body poses and velocities of the current state, or None without a model."""
-        if self._stale:
+        if self.stale:
             with self.lock:
                 self.derived()
         return self.data
@@ -278,14 +275,14 @@ class Mirror:
         """Return model and data with body poses and velocities of the current state. Call under the lock."""
         if self.model is None or self.data is None:
             return None
-        if self._stale:
+        if self.stale:
             import mujoco
 
             mujoco.mj_kinematics(self.model, self.data)
             mujoco.mj_comPos(self.model, self.data)
             mujoco.mj_camlight(self.model, self.data)
             mujoco.mj_comVel(self.model, self.data)
-            self._stale = False
+            self.stale = False
         return self.model, self.data
 
     def body_velocity(self, body_id: int) -> Floats | None:

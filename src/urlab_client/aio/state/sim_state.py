@@ -253,7 +253,7 @@ class SimState:
     def _publish(self, reply: StateReply | StateSnapshot) -> None:
         """Pass a state that was applied to the readers of streams and the observers."""
         own = self.publishers.own_steps
-        if own and isinstance(reply, StateReply) and not (self.live or self.session.features.publishes_steps):
+        if own.handlers and isinstance(reply, StateReply) and not (self.live or self.session.features.publishes_steps):
             own.publish(reply)
         for observer in self.observers:
             try:
@@ -275,7 +275,7 @@ class SimState:
             data = self.mirror.data
             if into_mirror and data is not None:
                 data.time = reply.time
-            self.mirror.mark_stale()
+            self.mirror.stale = True
             self.clocks.absorb(reply, received)
             if isinstance(reply, StateSnapshot):
                 self.user = reply.user
@@ -306,7 +306,7 @@ class SimState:
             record.qpos = np.concatenate([qpos, record.qpos[len(qpos) :]])
             if self.mirror.data is not None:
                 self.mirror.data.qpos[record.layout.qpos_adr[: len(qpos)]] = qpos
-            self.mirror.mark_stale()
+            self.mirror.stale = True
 
     def mirror_options(self, options: SimOptions) -> None:
         """Mirror the options that `set_sim_options` returned, all or none. Raises `ProtocolError`."""

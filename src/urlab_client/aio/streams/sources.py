@@ -95,23 +95,24 @@ class PublishedSource(Source[T_co]):
 
 
 class OwnSteps:
-    """Delivers the states in replies to receivers of snapshots if the server publishes only in live mode."""
+    """Delivers the states in replies to receivers of snapshots if the server publishes only in live mode.
+
+    Attributes:
+        handlers: The receivers.
+    """
 
     def __init__(self) -> None:
-        self._handlers: dict[MessageHandler, None] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._handlers)
+        self.handlers: dict[MessageHandler, None] = {}
 
     def attach(self, handler: MessageHandler) -> None:
-        self._handlers[handler] = None
+        self.handlers[handler] = None
 
     def detach(self, handler: MessageHandler) -> None:
-        self._handlers.pop(handler, None)
+        self.handlers.pop(handler, None)
 
     def publish(self, reply: StateReply) -> None:
         payload = StateSnapshot.of(reply).encode()
-        for handler in tuple(self._handlers):
+        for handler in tuple(self.handlers):
             handler.take(STATE_FULL, payload)
             handler.drain()
 
