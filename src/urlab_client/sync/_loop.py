@@ -93,7 +93,7 @@ class _Selector(selectors.DefaultSelector):
     _left_out = 0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        if timeout is not None and timeout <= 0 and self._left_out < _ROUNDS:  # callbacks are ready
+        if timeout == 0 and self._left_out < _ROUNDS:  # callbacks are ready
             self._left_out += 1
             return []
         self._left_out = 0
