@@ -280,6 +280,74 @@ def test_everything_is_done_by_keys_alone(still: Page) -> None:
     still.until(f"!({RUNNING})")
 
 
+def test_the_first_tab_stop_skips_to_the_controls(still: Page) -> None:
+    still.driver.refresh()
+    still.until(f"document.querySelector('{SLIDER}') !== null")
+    ActionChains(still.driver).send_keys(Keys.TAB).perform()
+    link = still.driver.switch_to.active_element
+    assert link.text == "Skip to controls"
+    assert link.rect["x"] >= 0
+    ActionChains(still.driver).send_keys(Keys.ENTER).perform()
+    still.until("document.activeElement.id === 'robots'")
+    header, robots = (
+        still.look(f"document.querySelector('{one}').getBoundingClientRect()") for one in ("header", ".robot")
+    )
+    assert robots["top"] >= header["bottom"]
+    assert link.rect["x"] < 0
+    for _ in range(2):  # the grip, and the title, of the first robot
+        ActionChains(still.driver).send_keys(Keys.TAB).perform()
+    assert still.look("document.activeElement.closest('.robot') !== null")
+
+
+def test_escape_makes_a_picture_small_and_stops_nothing_then(still: Page) -> None:
+    def escape() -> None:
+        ActionChains(still.driver).send_keys(Keys.ESCAPE).perform()
+
+    still.click("#play")
+    still.until(RUNNING)
+    camera = "#cameras [data-camera='arm/overview']"
+    still.driver.execute_script(f'document.querySelector("{camera}").scrollIntoView({{block: "center"}})')
+    still.find(f"{camera} .frame").click()
+    large = f'document.querySelector("{camera}").matches(".large")'
+    still.until(large)
+    escape()
+    still.until(f"!{large}")
+    still.find(f"{camera} [title='Full screen']").click()
+    still.until("document.fullscreenElement?.dataset.camera === 'arm/overview'")
+    picture = still.look("document.fullscreenElement.querySelector('canvas').getBoundingClientRect()")
+    assert picture["height"] > 0.8 * still.look("innerHeight")
+    assert picture["bottom"] < still.look("innerHeight"), "its buttons are below it"
+    escape()
+    still.until("document.fullscreenElement === null")
+    still.asked("api/status", lambda status: status["running"])
+    escape()
+    still.until(f"!({RUNNING})")
+
+
+def test_in_puppet_mode_joints_go_where_a_number_says_within_their_limits(still: Page) -> None:
+    def at(value: float) -> None:
+        joints = {one["name"]: one["index"] for one in still.ask("api/world")["articulations"][1]["joints"]}
+        still.asked(
+            "api/state", lambda state: abs(state["articulations"]["arm"]["qpos"][joints["elbow"]] - value) < 1e-3
+        )
+
+    still.choose("#mode", "puppet")
+    box = still.find("[data-robot=arm] [data-placed=elbow]")
+    still.until("document.querySelector('[data-robot=arm] [data-placed=elbow]').offsetParent !== null")
+    assert box.get_attribute("title") == "\u22121.4 … 2.62 rad"
+    box.send_keys(Keys.CONTROL, "a")
+    box.send_keys("0.7", Keys.ENTER)
+    at(0.7)
+    box.send_keys(Keys.CONTROL, "a")
+    box.send_keys("99", Keys.ENTER)
+    still.until("document.querySelector('#toasts').innerText.includes('99 is out of reach')")
+    at(2.61799)
+    assert still.look("+document.querySelector('[data-robot=arm] [data-place=elbow]').value") == pytest.approx(
+        2.618, abs=1e-3
+    )
+    still.choose("#mode", "live")
+
+
 def test_panels_are_moved_by_keys_and_by_the_mouse_and_stay_there(still: Page) -> None:
     first = still.look(PANELS)
     tab_to(still, "Move Log")

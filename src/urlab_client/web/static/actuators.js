@@ -1,4 +1,4 @@
-// Rows of the joint panel: an actuator's set-point as slider and number, beside the measured joint position.
+// A value with its limits as slider and number, and rows of the joint panel: an actuator's set-point beside the measured joint position.
 
 import { h, number, text, toast } from "./dom.js";
 import { setPoint } from "./link.js";
@@ -28,46 +28,68 @@ export function groups(art) {
   return [...found.values()];
 }
 
-export class ActuatorRow {
-  constructor(robot, actuator, art) {
-    this.robot = robot;
-    this.actuator = actuator;
-    this.joint = art.joints.find((one) => one.name === actuator.joint);
-    this.follows = actuator.takes === "position" && this.joint !== undefined; // the joint is on the slider's scale
-    const range = (this.range = actuator.range ?? UNKNOWN[actuator.takes]);
-    const name = actuator.name;
-    this.slider = h("input", { type: "range", min: range[0], max: range[1], step: (range[1] - range[0]) / 1000, value: 0,
-      "data-actuator": name, "aria-label": `${name} set-point${actuator.unit ? `, ${actuator.unit}` : ""}`, oninput: () => this.set(+this.slider.value) });
-    this.box = h("input", { type: "number", step: "any", "data-set-point": name, "aria-label": `${name} set-point as a number`,
-      onchange: () => this.box.value !== "" && this.type(+this.box.value) });
-    this.mark = h("i", { class: "mark", title: this.follows ? "Joint position" : "Applied control" });
-    this.measured = h("span", { class: "num", "data-value": name });
-    this.held = -Infinity;
-    const limits = actuator.range ? `${shortly(range[0])} … ${shortly(range[1])} ${actuator.unit}` : "no limits";
-    this.element = h("div", { class: "line", role: "group", "aria-label": name },
-      h("span", { class: "name", title: [actuator.kind, actuator.joint && `drives ${actuator.joint}`, limits].filter(Boolean).join(", ") }, name),
-      h("span", { class: "track" }, this.slider, this.mark,
-        h("small", { class: "low" }, actuator.range ? shortly(range[0]) : "no limit"),
-        h("small", { class: "high" }, actuator.range ? shortly(range[1]) : "no limit")),
-      this.box, this.measured,
-      h("span", { class: "few" },
-        h("button", { class: "tiny", title: `${name} to 0`, "aria-label": `${name} to 0`, onclick: () => this.zero() }, "0"),
-        h("button", { class: "tiny", title: `${name} home`, "aria-label": `${name} home`, onclick: () => this.home() }, "⌂")));
+/** A slider and a number field for one value with the limits `range`, or none; `send` is called with what a user sets. */
+export class Setting {
+  constructor(name, { unit, range, scale, label, send, slider = {}, box = {} }) {
+    Object.assign(this, { name, unit, range, scale: range ?? scale, send, held: -Infinity });
+    const [low, high] = this.scale;
+    const { limits } = this;
+    this.slider = h("input", { type: "range", min: low, max: high, step: (high - low) / 1000, value: 0,
+      "aria-label": `${label}${unit ? `, ${unit}` : ""}`, oninput: () => this.set(+this.slider.value), ...slider });
+    this.box = h("input", { type: "number", step: "any", title: limits, "aria-label": `${label} as a number`,
+      onchange: () => this.box.value !== "" && this.type(+this.box.value), ...box });
+    this.ends = [["low", low], ["high", high]].map(([end, value]) => h("small", { class: end }, range ? shortly(value) : "no limit"));
+  }
+
+  get limits() {
+    return this.range ? `${this.range.map(shortly).join(" … ")} ${this.unit}` : "no limits";
   }
 
   set(value) {
-    const within = Math.min(Math.max(value, this.actuator.range?.[0] ?? -Infinity), this.actuator.range?.[1] ?? Infinity);
+    const [low, high] = this.range ?? [-Infinity, Infinity];
+    const within = Math.min(Math.max(value, low), high);
     this.held = performance.now();
     this.slider.value = within;
     this.write(within);
-    setPoint(this.robot, this.actuator.name, within);
+    this.send(within);
   }
 
   /** Set what was typed, and say where it ends. */
   type(value) {
-    const [low, high] = this.actuator.range ?? [-Infinity, Infinity];
-    if (value < low || value > high) toast(`${this.actuator.name} goes from ${shortly(low)} to ${shortly(high)} ${this.actuator.unit}: ${shortly(value)} is out of reach, so it is set to ${shortly(value < low ? low : high)}.`);
+    const [low, high] = this.range ?? [-Infinity, Infinity];
+    if (value < low || value > high) toast(`${this.name} goes from ${shortly(low)} to ${shortly(high)} ${this.unit}: ${shortly(value)} is out of reach, so it is set to ${shortly(value < low ? low : high)}.`);
     this.set(value);
+  }
+
+  write(value) {
+    if (document.activeElement !== this.box || performance.now() - this.held < HELD_MS) this.box.value = value.toFixed(digits(this.scale)).replace(/^-(?=0\.?0*$)/, "");
+  }
+
+  /** Show a value that came, but not while the user moves it: the state is older than the input. */
+  show(value) {
+    if (value == null || performance.now() - this.held <= HELD_MS || this.slider.matches(":active")) return;
+    this.slider.value = value;
+    this.write(value);
+  }
+}
+
+export class ActuatorRow extends Setting {
+  constructor(robot, actuator, art) {
+    const { name } = actuator;
+    super(name, { unit: actuator.unit, range: actuator.range, scale: UNKNOWN[actuator.takes], label: `${name} set-point`,
+      send: (value) => setPoint(robot, name, value), slider: { "data-actuator": name }, box: { "data-set-point": name } });
+    this.actuator = actuator;
+    this.joint = art.joints.find((one) => one.name === actuator.joint);
+    this.follows = actuator.takes === "position" && this.joint !== undefined; // the joint is on the slider's scale
+    this.mark = h("i", { class: "mark", title: this.follows ? "Joint position" : "Applied control" });
+    this.measured = h("span", { class: "num", "data-value": name });
+    this.element = h("div", { class: "line", role: "group", "aria-label": name },
+      h("span", { class: "name", title: [actuator.kind, actuator.joint && `drives ${actuator.joint}`, this.limits].filter(Boolean).join(", ") }, name),
+      h("span", { class: "track" }, this.slider, this.mark, this.ends),
+      this.box, this.measured,
+      h("span", { class: "few" },
+        h("button", { class: "tiny", title: `${name} to 0`, "aria-label": `${name} to 0`, onclick: () => this.zero() }, "0"),
+        h("button", { class: "tiny", title: `${name} home`, "aria-label": `${name} home`, onclick: () => this.home() }, "⌂")));
   }
 
   zero() {
@@ -78,22 +100,14 @@ export class ActuatorRow {
     this.set(this.actuator.home);
   }
 
-  write(value) {
-    if (document.activeElement !== this.box || performance.now() - this.held < HELD_MS) this.box.value = value.toFixed(digits(this.range)).replace(/^-(?=0\.?0*$)/, "");
-  }
-
   draw(state) {
     const { index } = this.actuator;
     const applied = state.ctrl?.[index];
     const position = this.joint && state.qpos?.[this.joint.index];
     const target = state.targets?.[index] ?? (this.follows ? position : applied);
-    // Not while the user moves it: the state is older than the input.
-    if (target != null && performance.now() - this.held > HELD_MS && !this.slider.matches(":active")) {
-      this.slider.value = target;
-      if (document.activeElement !== this.box) this.write(target);
-    }
+    this.show(target);
     const where = this.follows ? position : applied;
-    this.mark.style.left = `calc(8px + ${share(where ?? 0, this.range)} * (100% - 16px))`; // the range of the thumb's centre
+    this.mark.style.left = `calc(8px + ${share(where ?? 0, this.scale)} * (100% - 16px))`; // the range of the thumb's centre
     const shown = this.joint ? [position, this.joint.unit] : [applied, this.actuator.unit];
     text(this.measured, `${number(shown[0])} ${shown[1]}`);
   }

@@ -3,7 +3,7 @@
 // During a replay they show the recorded pictures; cameras that were not recorded stay live and are marked.
 
 import { now, paused } from "./bar.js";
-import { $, choices, duration, h, heading, text } from "./dom.js";
+import { $, choices, duration, fullScreenButton, h, heading, text } from "./dom.js";
 import { clock, on, socketAt } from "./link.js";
 import { clockTime } from "./recording.js";
 
@@ -22,10 +22,10 @@ class CameraView {
     this.replay = null;
     this.state = h("span", { class: "waiting" }, "No picture yet.");
     this.still = null; // the simulation time of a picture that was fetched, and when
-    this.element = h("figure", { class: "camera", "data-camera": camera.path },
+    this.element = h("figure", { class: "camera", tabindex: -1, "data-camera": camera.path, onkeydown: (event) => this.key(event) }, // a click on it focuses it
       h("div", { class: "frame", onclick: () => this.enlarge() }, this.image, this.state),
       h("figcaption", {}, h("b", {}, title), h("span", { class: "tag" }, camera.mode), this.origin,
-        h("span", { class: "space" }), this.note, this.larger));
+        h("span", { class: "space" }), this.note, fullScreenButton(title, () => this.element), this.larger));
     this.frames = [];
     this.closed = false;
     this.watcher = new IntersectionObserver(([entry]) => (entry.isIntersecting ? this.open() : this.shut()));
@@ -80,7 +80,15 @@ class CameraView {
   }
 
   enlarge() {
-    this.larger.setAttribute("aria-pressed", this.element.classList.toggle("large"));
+    if (document.fullscreenElement) document.exitFullscreen();
+    else this.larger.setAttribute("aria-pressed", this.element.classList.toggle("large"));
+  }
+
+  /** Escape makes an enlarged picture small, and then stops nothing. */
+  key(event) {
+    if (event.key !== "Escape" || !this.element.matches(".large")) return;
+    event.stopPropagation();
+    this.enlarge();
   }
 
   /** Show whether the picture is recorded; cover one that remains from a replay that has ended. */

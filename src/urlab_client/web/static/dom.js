@@ -93,6 +93,12 @@ export function heading(title, ...rest) {
   return top;
 }
 
+/** Make a button that shows the element `shown()` on the whole screen, and again as before. */
+export function fullScreenButton(of, shown) {
+  return h("button", { class: "tiny", title: "Full screen", "aria-label": `Full screen: ${of}`, hidden: !document.fullscreenEnabled,
+    onclick: () => (document.fullscreenElement ? document.exitFullscreen() : shown().requestFullscreen()) }, "□");
+}
+
 /** Tell a screen reader what changed. */
 export const announce = (message) => text($("announcements"), message);
 

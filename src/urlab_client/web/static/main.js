@@ -16,7 +16,7 @@ import { makeView } from "./view.js";
 
 const KEYS = [
   [" ", "space", "play or pause", toggleRun],
-  ["Escape", "esc", "stop", stop],
+  ["Escape", "esc", "stop; in a picture that is enlarged or on the whole screen, make it small", () => (document.fullscreenElement ? document.exitFullscreen() : stop())],
   [".", ".", "step (direct mode)", () => (now.status?.mode === "direct" ? step() : toast("Steps need mode direct."))],
   ["r", "r", "reset", () => reset($("keyframe").value)],
   ["d", "d", "take or release the controls", drive],

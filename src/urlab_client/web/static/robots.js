@@ -1,6 +1,6 @@
 // Articulations: joint positions against their ranges, actuator sliders, gains, commanded twist.
 
-import { ActuatorRow, HELD_MS, UNKNOWN, actuatorTable, canHold, fallen, groups, limp, share, stillness } from "./actuators.js";
+import { ActuatorRow, Setting, UNKNOWN, actuatorTable, canHold, fallen, groups, limp, share, stillness } from "./actuators.js";
 import { now, reset } from "./bar.js";
 import { $, h, heading, number, text } from "./dom.js";
 import { ask, newest, on, op } from "./link.js";
@@ -50,29 +50,27 @@ class Robot {
     return row;
   }
 
-  /** A joint on its range; in mode puppet, a slider that places it. */
+  /** A joint on its range; in mode puppet, a slider and a number place it. */
   joint(joint) {
-    const range = joint.range;
-    const ends = range ?? (joint.unit === "m" ? UNKNOWN[""] : UNKNOWN.position);
-    const place = newest((value) => ask("POST", "api/pose", { [this.key]: { [joint.name]: value } }));
-    const slider = h("input", { type: "range", min: ends[0], max: ends[1], step: (ends[1] - ends[0]) / 1000, value: 0, hidden: true,
-      "data-place": joint.name, "aria-label": `Place ${joint.name}, ${joint.unit}`, oninput: () => { moved = performance.now(); place(+slider.value); } });
-    let moved = -Infinity;
-    const bar = h("i", { class: "mark" });
-    const shown = h("span", { class: "num", "data-joint": joint.name });
+    const { name, unit, range } = joint;
+    const setting = new Setting(name, { unit, range, scale: unit === "m" ? UNKNOWN[""] : UNKNOWN.position, label: `Place ${name}`,
+      send: newest((value) => ask("POST", "api/pose", { [this.key]: { [name]: value } })), slider: { "data-place": name }, box: { "data-placed": name } });
+    const placing = [setting.slider, setting.box, ...setting.ends];
+    const bar = range ? h("i", { class: "mark" }) : h("small", {}, "no limits");
+    const shown = h("span", { class: "num", "data-joint": name });
     this.rows.push((state) => {
       const value = state.qpos?.[joint.index];
-      text(shown, `${number(value)} ${joint.unit}`);
-      slider.hidden = !this.posing;
-      if (value != null && performance.now() - moved > HELD_MS && !slider.matches(":active")) slider.value = value;
+      text(shown, `${number(value)} ${unit}`);
+      placing.forEach((one) => { one.hidden = !this.posing; });
+      bar.hidden = this.posing;
+      setting.show(value);
       if (!range || value == null) return;
       const at = share(value, range);
       bar.style.left = `${100 * at}%`;
       bar.classList.toggle("limit", at < 0.02 || at > 0.98);
     });
-    return h("div", { class: "line", title: range ? `${range[0].toFixed(3)} … ${range[1].toFixed(3)} ${joint.unit}` : "no limits" },
-      h("span", { class: "name" }, joint.name),
-      h("span", { class: range ? "track bar" : "track" }, slider, range ? bar : h("small", {}, "no limits")), shown);
+    return h("div", { class: "line", title: setting.limits }, h("span", { class: "name" }, name),
+      h("span", { class: range ? "track bar" : "track" }, setting.slider, bar, setting.ends), setting.box, shown);
   }
 
   /** A table of gains by actuator; its first row sets those of all. */

@@ -3,7 +3,7 @@
 
 import { makeBodies } from "./bodies.js";
 import { showInstead } from "./cameras.js";
-import { $, h, text } from "./dom.js";
+import { $, fullScreenButton, h, text } from "./dom.js";
 import { on } from "./link.js";
 
 const OPEN = "urlab-view";
@@ -29,9 +29,11 @@ export function makeView() {
   const cover = h("p", { class: "cover", role: "status" });
   const stage = h("div", { class: "stage" }, cover);
   const bodies = makeBodies(() => stage.querySelector("iframe")?.contentWindow);
+  const screen = h("div", { class: "screen" }, bodies.bar, stage);
+  bodies.bar.append(fullScreenButton("3-D view", () => screen));
   const hint = h("p", { class: "hint" });
   const instead = h("div", { class: "instead" });
-  const box = h("details", { id: "view-box" }, h("summary", {}, h("h2", {}, "3-D view")), bodies.bar, stage, instead, hint);
+  const box = h("details", { id: "view-box" }, h("summary", {}, h("h2", {}, "3-D view")), screen, instead, hint);
   $("view").append(box);
   const here = { socket: false, link: "connecting", missing: "", shown: false };
   const unable = lacking();
