@@ -500,9 +500,17 @@ def test_the_controls_are_a_sheet_on_a_phone(page: Page) -> None:
         page.until("document.querySelector('#view .hint').textContent.includes('two fingers')")
         visible = "getComputedStyle(document.querySelector('#sheet')).visibility === 'visible'"
         page.until(f"!({visible})")
+        page.driver.execute_script("window.scrollTo(0, 0)")
         page.click("#sheet-toggle")
         page.until(visible)
         assert page.look("document.querySelector('#sheet').contains(document.querySelector('#mode'))")
+        page.until("getComputedStyle(document.querySelector('#sheet')).transform === 'none'")  # it slides
+        picture, sheet = (
+            page.look(f"document.querySelector('{one}').getBoundingClientRect().toJSON()")
+            for one in (".instead canvas", "#sheet")
+        )
+        assert sheet["height"] < 0.45 * PHONE["height"]
+        assert 0 <= picture["top"] < picture["bottom"] < sheet["top"], "what the controls move is seen above them"
         page.click("#sheet-toggle")
         page.until(f"!({visible})")
     page.until("document.querySelector('header').contains(document.querySelector('#mode'))")

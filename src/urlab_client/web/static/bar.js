@@ -28,13 +28,19 @@ const LINKS = {
   gone: "No console",
 };
 
-/** On a phone, the picture comes first and a sheet over it holds the controls. */
+/** On a phone, the picture comes first and a sheet below it holds the controls. */
 const PHONE = matchMedia("(max-width: 700px)");
 
+/** Open or close the sheet; the picture or curve that is looked at, the first whose middle is in sight, goes above it. */
 function toggleSheet() {
+  const picture = [...document.querySelectorAll(".stage:not(.unable), .camera, .curve")].find((one) => {
+    const { top, bottom } = one.getBoundingClientRect();
+    return top + bottom > 0 && top + bottom < 2 * innerHeight;
+  });
   const open = document.body.classList.toggle("sheet");
   ui.sheet.setAttribute("aria-expanded", open);
   text(ui.sheet, open ? "Close" : "Controls");
+  if (open) picture?.scrollIntoView();
 }
 
 export const run = (running) => ask("POST", "api/run", { running });

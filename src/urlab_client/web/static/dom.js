@@ -95,7 +95,7 @@ export function heading(title, ...rest) {
 
 /** Make a button that shows the element `shown()` on the whole screen, and again as before. */
 export function fullScreenButton(of, shown) {
-  return h("button", { class: "tiny", title: "Full screen", "aria-label": `Full screen: ${of}`, hidden: !document.fullscreenEnabled,
+  return h("button", { class: "tiny full", title: "Full screen", "aria-label": `Full screen: ${of}`, hidden: !document.fullscreenEnabled,
     onclick: () => (document.fullscreenElement ? document.exitFullscreen() : shown().requestFullscreen()) }, "□");
 }
 
