@@ -756,6 +756,30 @@ def test_another_program_takes_over_and_the_console_takes_it_back(http: TestClie
         heard(live, "status", lambda status: status["link"]["state"] == "connected")
 
 
+@pytest.mark.parametrize("mode", ["direct", "puppet"])
+def test_a_session_that_is_taken_back_has_the_step_mode_that_it_had(
+    http: TestClient, server: SimulatedServer, mode: str
+) -> None:
+    from urlab_client import URLabClient as Blocking
+
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        heard(live, "status", lambda status: status["link"]["state"] == "connected" and status["mode"] == "live")
+        with Blocking(**server.client_options()) as other:
+            other.discover()
+            other.runtime.set_mode(mode)
+            http.post("/api/ops/list_keyframes", json={})
+            heard(live, "status", lambda status: status["link"]["state"] == "taken_over")
+        heard(live, "status", lambda status: not status["moving"])
+        http.post("/api/connection", json={})
+        heard(live, "status", lambda status: status["link"]["state"] == "connected")
+        status = http.get("/api/status").json()
+        assert (status["mode"], status["running"]) == ("live", False), "physics that stood still stands still"
+        (entry,) = [one for one in http.get("/api/log").json() if one["what"] == "restore_mode"]
+        assert json.loads(entry["text"]) == {"mode": "live"}
+        assert http.post("/api/ops/set_paused", json={"paused": False}).status_code == 200
+        heard(live, "status", lambda status: status["running"])
+
+
 def test_it_can_be_mounted_in_a_backend_that_has_its_own_door(server: SimulatedServer) -> None:
     outer = mounted(server, "/lab", Access(hosts=["robots.example"], tokens=False))
     with TestClient(outer, base_url="http://robots.example") as client:

@@ -42,6 +42,7 @@ from urlab_client.events import (
     SessionLost,
     SessionOpened,
 )
+from urlab_client.protocol.messages.runtime import SetPaused
 from urlab_client.protocol.messages.session import ArticulationState
 
 if TYPE_CHECKING:
@@ -223,6 +224,8 @@ class ConsoleSession:
                     await self.client.resync(timeout=_CONNECT_S)
                 except URLabError:
                     await self._discover()
+            elif self.link.state == "taken_over" and self._handshake is None:
+                await self._take_back()
             else:
                 await self._discover()
         except ClientClosed:
@@ -236,6 +239,21 @@ class ConsoleSession:
         self._set_link("connected")
         self._ready.set()
         self._begin_anew()
+
+    async def _take_back(self) -> None:
+        """Open a session again with the step mode that the last one had; no op tells which another program has left."""
+        mode, stood = self.client.step_mode, not self._clock.advances
+        await self._discover()
+        if not self.client.manager_present:
+            return
+        try:
+            if mode is StepMode.LIVE and stood:
+                await self.client.call(SetPaused(paused=True))  # first: entering live mode does not pause
+            await self.client.runtime.set_mode(mode)
+        except URLabError as error:
+            self._note_error("set_mode", error)
+        else:
+            self.view.note("call", "console", "restore_mode", encode({"mode": mode}).decode())
 
     async def _discover(self) -> None:
         if self._handshake is None:

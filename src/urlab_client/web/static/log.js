@@ -43,6 +43,7 @@ const CALLS = {
   configure_controller: (given) => Object.entries(given.params).map(([gain, values]) => `set ${gain.replaceAll("_", " ")} of ${given.articulation}: ${alike(values)}`).join("; "),
   stop: () => "paused physics",
   reset: (given) => `reset the simulation${given.keyframe_name ? ` to ${given.keyframe_name}` : ""}`,
+  restore_mode: (given) => `chose step mode ${given.mode}, as before the other program`,
   set_mode: (given) => `chose step mode ${given.mode}`,
   set_sim_speed: (given) => `set the speed to ${shortly(given.percent)} %`,
   set_control_source: (given) => `made set-points of ${given.source === "ui" ? "the editor panel" : "programs"} drive`,
