@@ -132,12 +132,12 @@ class Page:
         shown = "document.querySelector('[data-robot=arm] [data-value=elbow]').textContent"
         return f"Math.abs(parseFloat({shown}.replace('\u2212', '-')) - {value}) < 0.03"
 
-    def curve(self, key: str, signal: str) -> list[float]:
-        """Return what the pointer reads of a signal along the curves with a key, from left to right, over 30 s.
+    def curve(self, key: str, signal: str, seconds: int = 30) -> list[float]:
+        """Return what the pointer reads of a signal along the curves with a key, from left to right.
 
-        That is long enough for a slow machine, whose simulation goes on while a test asks its page.
+        30 s are long enough for a slow machine, whose simulation goes on while a test asks its page.
         """
-        self.choose("#span", "30")
+        self.choose("#span", str(seconds))
         # Curves out of sight are not drawn: the page sees that they are in sight just before `seen` does.
         read: list[str] = self.driver.execute_async_script(
             "const [key, signal, done] = arguments; const one = document.querySelector(`[data-sensor='${key}']`);"

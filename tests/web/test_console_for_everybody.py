@@ -310,8 +310,6 @@ def test_escape_makes_a_picture_small_and_stops_nothing_then(still: Page) -> Non
     still.find(f"{camera} .frame").click()
     large = f'document.querySelector("{camera}").matches(".large")'
     still.until(large)
-    escape()
-    still.until(f"!{large}")
     still.find(f"{camera} [title='Full screen']").click()
     still.until("document.fullscreenElement?.dataset.camera === 'arm/overview'")
     picture = still.look("document.fullscreenElement.querySelector('canvas').getBoundingClientRect()")
@@ -319,6 +317,9 @@ def test_escape_makes_a_picture_small_and_stops_nothing_then(still: Page) -> Non
     assert picture["bottom"] < still.look("innerHeight"), "its buttons are below it"
     escape()
     still.until("document.fullscreenElement === null")
+    assert still.look(large)
+    escape()
+    still.until(f"!{large}")
     still.asked("api/status", lambda status: status["running"])
     escape()
     still.until(f"!({RUNNING})")

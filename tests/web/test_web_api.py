@@ -7,6 +7,7 @@ import base64
 import contextlib
 import hashlib
 import io
+import itertools
 import json
 import re
 import time
@@ -324,6 +325,23 @@ def test_a_binary_frame_closes_its_socket_and_no_other(http: TestClient, path: s
             messages = (socket.receive() for _ in attempts("the socket was not closed"))
             assert next(said for said in messages if said["type"] == "websocket.close")["code"] == 1003
         heard(other, "status")
+
+
+def test_the_states_of_the_last_seconds_are_kept_without_a_hole(http: TestClient) -> None:
+    http.post("/api/ops/set_paused", json={"paused": False})
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        heard(live, "state", lambda state: state["time"] > 0.6)
+        http.post("/api/ops/set_paused", json={"paused": True})
+        end = heard(live, "status", lambda status: not status["moving"]) and heard(live, "state")["time"]
+        times = [state["time"] for state in http.get("/api/states").json()["states"]]
+        assert times == sorted({*times})
+        assert times[-1] == end
+        assert max(later - earlier for earlier, later in itertools.pairwise(times)) < 0.2
+        after = [state["time"] for state in http.get(f"/api/states?after={times[3]}").json()["states"]]
+        assert after == times[4:]
+        http.post("/api/ops/reset", json={})
+        heard(live, "state", lambda state: state["time"] < end)
+        assert [state["time"] for state in http.get("/api/states").json()["states"]] == [0.0], "of another run"
 
 
 def test_a_message_too_deep_to_read_is_refused(http: TestClient) -> None:

@@ -400,7 +400,7 @@ def test_curves_can_be_added_read_hidden_and_held(page: Page) -> None:
     assert page.look(read) == held
     page.click("#pause-curves")
     page.until(f"{read} !== '{held}'")
-    page.click('[data-sensor="arm/qpos/rad"] .tiny')
+    page.click('[data-sensor="arm/qpos/rad"] [title^=Remove]')
     page.until(f"{curve} === null")
 
 
@@ -450,7 +450,7 @@ def test_held_curves_outlive_a_reset(page: Page) -> None:
     page.until(RUNNING)
     page.until("parseFloat(document.querySelector('#time').textContent) > 0.5")
     assert max(page.curve("arm/qpos/rad", "elbow")) < 0.5
-    page.click('[data-sensor="arm/qpos/rad"] .tiny')
+    page.click('[data-sensor="arm/qpos/rad"] [title^=Remove]')
 
 
 def test_a_curve_that_is_added_has_a_past(page: Page) -> None:
@@ -467,15 +467,72 @@ def test_a_curve_that_is_added_has_a_past(page: Page) -> None:
     page.until("document.querySelector('[data-sensor=\"arm/qpos/rad\"]') !== null")
     past = page.curve("arm/qpos/rad", "elbow")
     assert min(past) < 0.5 < max(past)
-    page.click('[data-sensor="arm/qpos/rad"] .tiny')
+    page.click('[data-sensor="arm/qpos/rad"] [title^=Remove]')
     page.choose("#add-curve", "arm/follows/elbow")
     page.until("document.querySelector('[data-sensor=\"arm/follows/elbow\"]') !== null")
     wanted, position = (page.curve("arm/follows/elbow", name) for name in ("set-point", "position"))
     assert {0.0, 0.9} <= {*wanted}, "the set-point jumps"
     assert any(0.1 < value < 0.8 for value in position), "and the joint follows"
-    page.click('[data-sensor="arm/follows/elbow"] .tiny')
+    page.click('[data-sensor="arm/follows/elbow"] [title^=Remove]')
     page.click("#play")
     page.until(RUNNING)
+
+
+def test_what_a_page_has_skipped_or_was_before_it_is_in_its_curves(page: Page, tmp_path: Path) -> None:
+    def moved(one: Page) -> bool:
+        return any(0.1 < value < 0.8 for value in one.curve("arm/qpos/rad", "elbow", 8))
+
+    page.until(RUNNING)
+    page.choose("#add-curve", "arm/qpos/rad")
+    page.slide(0.0)
+    page.until(page.elbow_is(0.0))
+    page.slide(0.9)
+    page.driver.execute_async_script(  # as soon as the set-point is sent, the page is busy, until the arm is there
+        "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => {"
+        "const began = performance.now(); while (performance.now() < began + 2000); done(); }))"
+    )
+    page.until(page.elbow_is(0.9))
+    page.click("#stop")
+    page.until(f"!({RUNNING})")
+    WebDriverWait(page.driver, PATIENCE_S).until(lambda _: moved(page), "the hole stays")
+    with opened(tmp_path, page.invitation()) as second:
+        second.until("document.querySelector('#add-curve')?.options.length > 1")
+        second.choose("#add-curve", "arm/qpos/rad")
+        second.until("document.querySelector('[data-sensor=\"arm/qpos/rad\"]') !== null")
+        WebDriverWait(second.driver, PATIENCE_S).until(lambda _: moved(second), "a page begins without a past")
+    page.click('[data-sensor="arm/qpos/rad"] [title^=Remove]')
+    page.click("#play")
+    page.until(RUNNING)
+
+
+def test_the_scale_of_a_curve_is_fixed_and_released(page: Page) -> None:
+    def axis(value: float) -> list[int]:
+        page.slide(value)
+        page.until(page.elbow_is(value))
+        return page.driver.execute_async_script(
+            "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => {"
+            f"const canvas = {curve}.querySelector('canvas');"
+            "done([...canvas.getContext('2d').getImageData(0, 0, 40, canvas.height).data]); }))"
+        )
+
+    curve = "document.querySelector('[data-sensor=\"arm/qpos/rad\"]')"
+    page.until(RUNNING)
+    page.choose("#span", "2")
+    page.choose("#add-curve", "arm/qpos/rad")
+    page.until(f"{curve} !== null")
+    page.driver.execute_script(f"{curve}.scrollIntoView({{block: 'center'}})")
+    page.until(f"/\\d/.test({curve}.querySelector('.signal .num').textContent)")
+    axis(0.2)
+    fix = page.look(f"{curve}.querySelector('[aria-label^=\"Fix the y scale\"]')")
+    fix.click()
+    assert fix.get_attribute("aria-pressed") == "true"
+    assert axis(0.2) == axis(0.9), "the scale stays, although the curve leaves it"
+    fixed = axis(0.9)
+    fix.click()
+    assert fix.get_attribute("aria-pressed") == "false"
+    assert axis(0.9) != fixed
+    page.click('[data-sensor="arm/qpos/rad"] [title^=Remove]')
+    page.choose("#span", "8")
 
 
 def test_the_log_is_for_people_and_every_control_has_a_name_and_a_size(page: Page) -> None:

@@ -84,6 +84,12 @@ class State(Struct, tag_field="type", tag="state"):
     recorded: bool = False
 
 
+class StateList(Struct):
+    """States, oldest first."""
+
+    states: list[State]
+
+
 class RunningRecording(Struct):
     """The recording that is under way: its file's name, length so far in seconds of its clock, states, pictures, bytes.
 

@@ -15,6 +15,8 @@ from collections.abc import Generator, Iterable, Mapping
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from msgspec import Raw
+
 from urlab_client.console.description import WorldDescription, describe
 from urlab_client.console.messages import LogEntry, World, encode, state_message
 from urlab_client.protocol.messages.streams import StateSnapshot
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 log: logging.Logger = logging.getLogger("urlab_client.web")
 
 _KEPT = 300
+_KEPT_STATES = 600  # ten seconds, which are more than the page's curves span at first
 _BURST_S = 5.0
 
 
@@ -48,6 +51,7 @@ class SharedView:
         self.snapshot: StateSnapshot | None = None
         self.state_seq: int = 0
         self.state_json: str | None = None
+        self._recent: deque[tuple[float, Raw]] = deque(maxlen=_KEPT_STATES)
         self.n_changes: int = 0
         self._client = client
         self._watchers: set[asyncio.Event] = set()
@@ -99,8 +103,17 @@ class SharedView:
         """Show a state, and what viewers have commanded by articulation."""
         self.snapshot = snapshot
         self.state_seq += 1
-        self.state_json = encode(state_message(self.state_seq, snapshot, targets, recorded=recorded)).decode()
+        encoded = encode(state_message(self.state_seq, snapshot, targets, recorded=recorded))
+        self.state_json = encoded.decode()
+        if not recorded:
+            if self._recent and snapshot.time <= self._recent[-1][0]:
+                self._recent.pop() if snapshot.time == self._recent[-1][0] else self._recent.clear()
+            self._recent.append((snapshot.time, Raw(encoded)))
         self.notify()
+
+    def states_after(self, time: float) -> list[Raw]:
+        """Return the messages of the simulation's states after a time since it began, of those that are kept."""
+        return [encoded for at, encoded in self._recent if at > time]
 
     def describe_world(self) -> None:
         """Describe the world again after a change."""

@@ -13,7 +13,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from urlab_client.console.messages import ReplayView, State, state_message
+from urlab_client.console.messages import ReplayView, StateList, state_message
 from urlab_client.console.model_import import WouldReplace, make_blueprint, receive_model
 from urlab_client.console.recordings import RecordingContents, RecordingView
 from urlab_client.errors import URLabError
@@ -62,12 +62,6 @@ class RecordingList(Struct):
 
     recordings: list[RecordingView]
     folder: str
-
-
-class StateList(Struct):
-    """States, oldest first."""
-
-    states: list[State]
 
 
 class ImportedModel(Struct):

@@ -15,7 +15,7 @@ from urlab_client.console.body_pushing import BodyList, BodyView, Pick, Picked, 
 from urlab_client.console.controls import SERVED, SteppedTo, parse
 from urlab_client.console.description import WorldDescription
 from urlab_client.console.lease import Viewer
-from urlab_client.console.messages import LogEntry, State, Status, encode
+from urlab_client.console.messages import LogEntry, State, StateList, Status, encode
 from urlab_client.console.session import ConsoleSession
 from urlab_client.enums import StepMode
 from urlab_client.integrations.forwarding import EventStream
@@ -91,6 +91,12 @@ async def state(call: Call) -> Response:
     if shown is None:
         return refusal(503, "no_state", "No state has arrived yet.", "Is play running?")
     return Response(shown, media_type=JSON)
+
+
+@endpoint("GET", "/api/states", reply=StateList)
+async def past(call: Call, after: float = -1.0) -> Response:
+    """The simulation's states of the last ten seconds, those after `?after` seconds since it began."""
+    return json_response({"states": call.console.view.states_after(after)})
 
 
 @endpoint("GET", "/api/log")

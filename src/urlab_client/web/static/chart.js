@@ -6,7 +6,7 @@ export const COLORS = ["--c1", "--c2", "--c3", "--c4", "--c5", "--c6"];
 const DASHES = [[], [6, 3], [2, 2]]; // more signals than colours
 const PAD = { left: 46, right: 6, top: 6, bottom: 16 };
 const SHOWN_AT_FIRST = 6;
-const LEAST_S = 0.2;
+export const LEAST_S = 0.2;
 const LEAST_DRAG = 8; // pixels
 const GAP = 4; // times the mean distance
 
@@ -28,6 +28,15 @@ export class ChartData {
       this.times.splice(0, cut);
       this.values.splice(0, cut);
     }
+  }
+
+  /** Put values of a time span in the place of those that are there. */
+  put(times, values) {
+    if (!times.length) return;
+    const from = this.at(times[0]);
+    const count = this.at(times.at(-1) + 1e-9) - from;
+    this.times.splice(from, count, ...times);
+    this.values.splice(from, count, ...values);
   }
 
   /** The index of the first value that is not before `time`. */
@@ -54,7 +63,7 @@ function ticks(low, high, count) {
 
 export class Chart {
   constructor(source, view, data, { close, touchAll, zoom }) {
-    Object.assign(this, { source, view, data, signature: source.signature, stale: true, seen: false });
+    Object.assign(this, { source, view, data, signature: source.signature, stale: true, seen: false, scale: null, drawn: null });
     this.hidden = new Set(source.signals.slice(SHOWN_AT_FIRST).map((_, i) => i + SHOWN_AT_FIRST));
     this.canvas = h("canvas", { role: "img", "aria-label": `${source.title} over time${source.unit ? `, ${source.unit}` : ""}` });
     this.values = source.signals.map(() => h("span", { class: "num" }));
@@ -66,8 +75,10 @@ export class Chart {
         this.touch();
       },
     }, h("i", { class: `swatch s${i % COLORS.length}${i >= COLORS.length ? " dashed" : ""}` }), h("span", {}, name), this.values[i])));
+    const fix = h("button", { class: "tiny", title: "Fix this y scale; what leaves it is cut off", "aria-label": `Fix the y scale of ${source.title}`, "aria-pressed": "false",
+      onclick: () => { this.scale = this.scale ? null : this.drawn; fix.setAttribute("aria-pressed", this.scale !== null); this.touch(); } }, "↕");
     this.element = h("div", { class: "curve", "data-sensor": source.key },
-      h("div", { class: "line" }, h("b", {}, source.title), h("span", { class: "tag" }, source.unit), h("span", { class: "space" }),
+      h("div", { class: "line" }, h("b", {}, source.title), h("span", { class: "tag" }, source.unit), h("span", { class: "space" }), fix,
         h("button", { class: "tiny", title: `Remove ${source.title}`, "aria-label": `Remove ${source.title}`, onclick: close }, "×")),
       this.canvas, legend);
     new IntersectionObserver(([entry]) => { this.seen = entry.isIntersecting; this.stale = true; }).observe(this.canvas);
@@ -130,9 +141,10 @@ export class Chart {
     const paint = this.canvas.getContext("2d");
     paint.setTransform(ratio, 0, 0, ratio, 0, 0);
     paint.clearRect(0, 0, width, height);
-    let [low, high] = [Infinity, -Infinity];
-    for (let k = from; k < to; k++) for (const i of shown) { low = Math.min(low, values[k][i]); high = Math.max(high, values[k][i]); }
+    let [low, high] = this.scale ?? [Infinity, -Infinity];
+    if (!this.scale) for (let k = from; k < to; k++) for (const i of shown) { low = Math.min(low, values[k][i]); high = Math.max(high, values[k][i]); }
     if (!Number.isFinite(low)) [low, high] = [-1, 1];
+    this.drawn = [low, high];
     const middle = (low + high) / 2;
     const half = Math.max((high - low) / 2, 0.02 * Math.abs(middle), 1e-3) * 1.12;
     const x = (time) => PAD.left + (1 - (end - time) / span) * (width - PAD.left - PAD.right);
@@ -163,7 +175,7 @@ export class Chart {
       paint.globalAlpha = 1;
     }
     paint.save();
-    paint.beginPath(); paint.rect(PAD.left, 0, width - PAD.left - PAD.right, height); paint.clip();
+    paint.beginPath(); paint.rect(PAD.left, 0, width - PAD.left - PAD.right, height - PAD.bottom); paint.clip();
     paint.lineWidth = 1.6;
     paint.lineJoin = "round";
     // Where states did not come, there is no curve.

@@ -1,12 +1,13 @@
 // Curves over the last seconds of simulation time: sensors, and each robot's joints and actuators.
 
-import { Chart, ChartData, COLORS } from "./chart.js";
+import { Chart, ChartData, COLORS, LEAST_S } from "./chart.js";
 import { $, h, heading } from "./dom.js";
 import { ask, on } from "./link.js";
 
 const SPANS = [2, 8, 30, 120];
 const AXES = { 3: ["x", "y", "z"], 4: ["w", "x", "y", "z"] };
 const KEPT_S = SPANS.at(-1);
+const MISSED_MS = 500; // while a page opens it skips states again and again
 const span = h("select", { id: "span", "aria-label": "Seconds of the curves", title: "Seconds of the curves; drag over a curve to enlarge a part of it", onchange: () => {
   view.zoomed = null;
   charts.forEach((chart) => chart.touch());
@@ -30,9 +31,11 @@ let all = []; // the sources of all curves, shown or not
 let charts = [];
 let replay = null;
 let came = 0;
-let newest = 0; // of the simulation's times
+let newest = -1; // of the simulation's times
 let filling = false;
 let again = false;
+let missed = Infinity; // the time after which the simulation's states are missing
+let fetching = false;
 
 const store = () => (replay ? kept.recorded : kept.live);
 
@@ -48,7 +51,10 @@ function take(state) {
     view.apart = view.held;
     if (!replay && !view.apart) connect();
   }
-  if (!state.recorded) newest = state.time;
+  if (!state.recorded) {
+    if (newest < 0 || state.time > newest + LEAST_S) fetchMissed(newest);
+    newest = state.time;
+  }
   const curves = state.recorded ? kept.recorded : kept.live;
   const shown = new Set(charts.map((chart) => chart.signature));
   for (const source of all) {
@@ -61,6 +67,27 @@ function take(state) {
   view.last = state.time;
   view.first = Math.max(view.first, view.last - KEPT_S);
   if (!view.held) charts.forEach((chart) => chart.touch());
+}
+
+/** Fetch the states of the simulation that this page has skipped, or that were before it was opened. */
+async function fetchMissed(after) {
+  missed = Math.min(missed, after);
+  if (fetching) return;
+  fetching = true;
+  while (missed < Infinity) {
+    await new Promise((go) => setTimeout(go, MISSED_MS));
+    const [curves, since] = [kept.live, missed];
+    missed = Infinity;
+    const past = await ask("GET", `api/states?after=${since}`, undefined, { quiet: true });
+    if (!past || curves !== kept.live) continue; // it was reset
+    for (const source of all) {
+      const found = past.states.filter((state) => state.time <= newest && state.articulations[source.art])
+        .map((state) => [state.time, source.read(state.articulations[source.art])]).filter(([, values]) => values);
+      dataOf(curves, source.signature).put(found.map(([time]) => time), found.map(([, values]) => values));
+    }
+    if (!replay && !view.apart) connect();
+  }
+  fetching = false;
 }
 
 /** Show what is kept. */
