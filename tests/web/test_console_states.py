@@ -109,6 +109,23 @@ def test_keys_are_the_consoles_after_a_click_into_the_3d_view(playing: Page) -> 
     page.ask("api/lease", {})
 
 
+def test_the_3d_view_fills_the_screen_with_its_tools(playing: Page) -> None:
+    page = playing
+    drawn(page)
+    page.driver.execute_script("window.scrollTo(0, 0)")
+    full = page.find("#view [title='Full screen']")
+    full.click()
+    page.until("document.fullscreenElement?.matches('.screen')")
+    boxes = [
+        page.look(f"document.querySelector('{one}').getBoundingClientRect().toJSON()") for one in ("#fit", ".stage")
+    ]
+    assert 0 <= boxes[0]["top"] < boxes[0]["bottom"] <= boxes[1]["top"]
+    assert boxes[1]["height"] > 0.8 * page.look("innerHeight")
+    assert boxes[1]["bottom"] == pytest.approx(page.look("innerHeight"), abs=1)
+    full.click()
+    page.until("document.fullscreenElement === null")
+
+
 def test_a_list_gives_the_keyboard_back(playing: Page) -> None:
     page = playing
     page.driver.execute_script(
