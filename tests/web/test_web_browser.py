@@ -523,6 +523,8 @@ def test_the_scale_of_a_curve_is_fixed_and_released(page: Page) -> None:
     page.driver.execute_script(f"{curve}.scrollIntoView({{block: 'center'}})")
     page.until(f"/\\d/.test({curve}.querySelector('.signal .num').textContent)")
     axis(0.2)
+    now = page.ask("api/state")["time"]
+    page.asked("api/state", lambda state: state["time"] > now + 2.2)  # what came before is out of the picture
     fix = page.look(f"{curve}.querySelector('[aria-label^=\"Fix the y scale\"]')")
     fix.click()
     assert fix.get_attribute("aria-pressed") == "true"
@@ -530,7 +532,7 @@ def test_the_scale_of_a_curve_is_fixed_and_released(page: Page) -> None:
     fixed = axis(0.9)
     fix.click()
     assert fix.get_attribute("aria-pressed") == "false"
-    assert axis(0.9) != fixed
+    WebDriverWait(page.driver, PATIENCE_S).until(lambda _: axis(0.9) != fixed)
     page.click('[data-sensor="arm/qpos/rad"] [title^=Remove]')
     page.choose("#span", "8")
 
