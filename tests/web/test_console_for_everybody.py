@@ -108,6 +108,9 @@ def test_a_simulation_that_stands_still_shows_pictures_also_instead_of_the_3d_vi
     still.until(f"document.querySelector('.instead .camera').dataset.camera === '{other}'")
     still.until(f"{drawn}(document.querySelector('.instead canvas'))")
     assert not still.look("document.querySelector('.instead .num').classList.contains('old')")
+    for shown in (True, False):
+        still.find(".instead .frame").click()
+        still.until(f"(document.fullscreenElement?.matches('.instead .camera') ?? false) === {str(shown).lower()}")
 
 
 def test_a_robot_that_has_fallen_is_stood_up_and_held(still: Page) -> None:

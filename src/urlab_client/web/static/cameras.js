@@ -81,6 +81,7 @@ class CameraView {
 
   enlarge() {
     if (document.fullscreenElement) document.exitFullscreen();
+    else if (!this.larger.isConnected) this.element.requestFullscreen?.(); // in the place of the 3-D view
     else this.larger.setAttribute("aria-pressed", this.element.classList.toggle("large"));
   }
 
