@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Generator, Iterable, Mapping
@@ -106,8 +107,11 @@ class SharedView:
         encoded = encode(state_message(self.state_seq, snapshot, targets, recorded=recorded))
         self.state_json = encoded.decode()
         if not recorded:
-            if self._recent and snapshot.time <= self._recent[-1][0]:
-                self._recent.pop() if snapshot.time == self._recent[-1][0] else self._recent.clear()
+            before = self._recent[-1][0] if self._recent else -math.inf
+            if snapshot.time == before:
+                self._recent.pop()
+            elif snapshot.time < before:  # it was reset
+                self._recent.clear()
             self._recent.append((snapshot.time, Raw(encoded)))
         self.notify()
 
