@@ -317,6 +317,20 @@ def test_hosts(host: str, address: str, connect: Connect) -> None:
         connect(server).hello()
 
 
+def test_a_host_of_ipv6() -> None:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError as error:
+        pytest.skip(f"this machine has no IPv6: {error}")
+    with SimulatedServer("ball", host="::1", play=True) as server, URLabClient(**server.client_options()) as client:
+        assert server.address == "tcp://[::1]"
+        client.discover()
+        client.runtime.set_mode("live")
+        client.runtime.set_paused(False)
+        with client.state_stream("latest") as states:
+            assert next(states).time >= 0.0
+
+
 @pytest.mark.parametrize("host", ["no-such-host.invalid", "203.0.113.1"])
 def test_a_host_of_another_machine(host: str) -> None:
     with pytest.raises(OSError, match=host):

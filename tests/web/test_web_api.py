@@ -515,6 +515,11 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
             http.post("/api/replay", json={"time": wanted})
             placed = http.post("/api/ops/forward", json={}).json()["per_articulation"]["arm"]["qpos"][place]
             assert placed == pytest.approx(recorded[row], abs=1e-4)
+        http.post("/api/replay", json={"time": 0.0, "playing": True})
+        for _ in attempts("the robots are not placed while it plays"):
+            placed = http.post("/api/ops/forward", json={}).json()["per_articulation"]["arm"]["qpos"][place]
+            if placed == pytest.approx(recorded[-1], abs=1e-4):
+                break
         http.delete("/api/replay")
         assert http.get("/api/status").json()["mode"] == "direct"
         reached = http.post("/api/ops/forward", json={}).json()["per_articulation"]["arm"]["qpos"][place]

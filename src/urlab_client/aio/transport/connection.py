@@ -172,6 +172,7 @@ class Connection:
         # a full queue delays heartbeats until the connection is closed; without this option, libzmq 4.3.5 (issue 3937)
         # aborts the process when the queue is read after that, because the next connection would reuse the old pipe.
         socket.immediate = True
+        socket.ipv6 = "[" in endpoint  # with names it would prefer IPv6, also where the server has none
         if keys is not None:
             keys.protect(socket)
         with uninterrupted():
