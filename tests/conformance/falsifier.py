@@ -79,6 +79,27 @@ def in_reply(op: str, change: Callable[[Fields], object]) -> OnReply:
     return apply
 
 
+def refusal(op: str, code: str, /, **fields: Any) -> OnReply:
+    """Change the code of the refusals of an op, with these fields or without those that are None."""
+
+    def apply(request: Fields, reply: Fields) -> None:
+        asked = request.get("op") == op and all(request.get(name) == value for name, value in fields.items())
+        if asked and reply.get("code") == code:
+            reply["code"] = "busy"
+
+    return apply
+
+
+def failing(op: str) -> OnReply:
+    """Refuse an op that the server has carried out."""
+
+    def apply(request: Fields, _: Fields) -> object:
+        error = {"op": "error", "code": "internal_error", "message": "falsified"}
+        return msgspec.msgpack.encode(error) if request.get("op") == op else None
+
+    return apply
+
+
 def in_request(op: str, change: Callable[[Fields], object]) -> OnRequest:
     def apply(request: Fields) -> None:
         if request.get("op") == op:
@@ -140,6 +161,20 @@ class Kept:
         if self.name in fields:
             self.value = fields[self.name] if self.value is None else self.value
             fields[self.name] = self.value
+
+
+class InLive:
+    """Changes the replies to steps in live mode."""
+
+    def __init__(self, change: Callable[[Fields], object]) -> None:
+        self._change = change
+        self._live = False
+
+    def __call__(self, request: Fields, reply: Fields) -> None:
+        if request.get("op") == "set_mode":
+            self._live = request["mode"] == "live"
+        elif self._live and reply.get("op") == "step_ok":
+            self._change(reply)
 
 
 class EndedJobs:

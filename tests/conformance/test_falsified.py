@@ -17,16 +17,19 @@ from falsifier import (
     EndedJobs,
     Falsifier,
     Fields,
+    InLive,
     Kept,
     Previous,
     SameJob,
     drop,
     each,
+    failing,
     in_reply,
     in_request,
     in_state,
     narrowed,
     put,
+    refusal,
 )
 from targets import bench, furnish, server
 
@@ -73,6 +76,36 @@ def unguarded(request: Fields, reply: Fields, *, only: str = "") -> object:
     clock = {"sec": 0.0, "nsec": 0.0}
     taken: Fields = {"op": "step_ok", "time": 0.0, "step": 0.0, "sim_time": clock, "wall_time": clock}
     return msgspec.msgpack.encode({**taken, "frame_id": 1.0, "arts": {}, "scene": {}})
+
+
+def earlier_cameras(request: Fields, reply: Fields) -> None:
+    """Leave out a picture that is asked for as the latest."""
+    if "latest" in (request.get("include_cameras") or {}).values():
+        reply.pop("cameras", None)
+
+
+def any_picture(chosen: Fields) -> Fields:
+    return {name: "latest" if isinstance(how, dict) else how for name, how in chosen.items()}
+
+
+def unknown_fields(request: Fields, _: Fields) -> object:
+    """Refuse a request with a field that the op does not have."""
+    error = {"op": "error", "code": "bad_request", "message": "falsified"}
+    return msgspec.msgpack.encode(error) if "no_such_field" in request else None
+
+
+_seconds = itertools.count()
+
+
+def passing(reply: Fields) -> None:
+    """Give every reply a later time."""
+    reply["time"] = float(next(_seconds))
+
+
+def kept_actor(request: Fields, reply: Fields) -> None:
+    """Say that an actor was removed that is still there."""
+    if request.get("op") == "destroy_actor":
+        reply.update(op="destroy_actor_ok")
 
 
 def touched(reply: Fields) -> None:
@@ -387,6 +420,156 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
             )
         },
     ),
+    # The level and its actors
+    "no level that is open": (
+        ANY,
+        "Editor 3.1 current_level",
+        {"reply": in_reply("current_level_ok", drop("level_path"))},
+    ),
+    "a second manager": (
+        ANY,
+        "Editor 3.1 ensure_manager",
+        {"reply": in_reply("ensure_manager_ok", put("was_existing", False))},
+    ),
+    "the number of cells": (ANY, "Editor 3.1 spawn_grid", {"reply": in_reply("spawn_grid_ok", put("count", 3.0))}),
+    "the ids of cells": (
+        ANY,
+        "Editor 3.1 spawn_grid",
+        {"request": in_request("spawn_grid", put("base_actor_id", "cel"))},
+    ),
+    "the places of cells": (
+        ANY,
+        "Editor 3.1 spawn_grid",
+        {"request": in_request("spawn_grid", put("spacing", [1.0, 1.0, 0.0]))},
+    ),
+    "an actor that stays": (
+        ANY,
+        "Editor 3.1 destroy_actor",
+        {"request": in_request("destroy_actor", put("target", "nobody")), "reply": kept_actor},
+    ),
+    "the middle of bounds": (
+        ANY,
+        "Editor 3.3 get_actor_bounds",
+        {"reply": in_reply("get_actor_bounds_ok", each("center", lambda v: [v[0], v[1], v[2] + 1.0]))},
+    ),
+    "bounds of another actor": (
+        ANY,
+        "Editor 3.3 get_actor_bounds",
+        {
+            "reply": in_reply(
+                "get_actor_bounds_ok",
+                lambda r: r.update({name: [r[name][0] + 50.0, *r[name][1:]] for name in ("min", "max", "center")}),
+            )
+        },
+    ),
+    "what a saved level has": (
+        ANY,
+        "Editor 3.1 save_level",
+        {"request": in_request("spawn_actor", put("location", [2.0, 0.0, 0.0]))},
+    ),
+    "an asset that was there": (
+        ANY,
+        "Editor 3.1 destroy_asset",
+        {"reply": in_reply("destroy_asset_ok", put("was_found", True))},
+    ),
+    "other robots as play begins": (
+        ANY,
+        "Editor 3.2 begin_pie",
+        {
+            "reply": in_reply(
+                "begin_pie_ok", lambda r: r["handshake_payload"]["articulations"][0].update(actor_id="x") and None
+            )
+        },
+    ),
+    "play that begins unpaused": (
+        ANY,
+        "Editor 3.2 begin_pie",
+        {"reply": in_reply("step_ok", passing)},
+    ),
+    "a state of play": (ANY, "Editor 3.2 pie_status", {"reply": in_reply("pie_status_ok", put("state", "resting"))}),
+    "play that is off": (ANY, "Editor 3.2 pie_status", {"reply": in_reply("pie_status_ok", put("state", "off"))}),
+    # Modes, channels and streams
+    "a reply without entities": (ANY, "Session 8.3", {"reply": in_reply("step_ok", drop("entities"))}),
+    "a reply without the time of day": (ANY, "Session 8.3", {"reply": in_reply("step_ok", drop("wall_time"))}),
+    "a live set-point that is ignored": (
+        "beta",
+        "Beta 34",
+        {"reply": in_state(each("ctrl", lambda v: [0.0 for _ in v]))},
+    ),
+    "time that passes while it is paused": (
+        ANY,
+        "Beta 88",
+        {"reply": in_reply("forward_ok", each("time", lambda v: v + 1.0))},
+    ),
+    "a step of two robots of which one is nobody's": ("beta", "Beta 17", {"reply": unguarded}),
+    "another owner": ("beta", "Beta 14", {"reply": in_reply("error:control_claimed", put("owner", "nobody"))}),
+    "commands to another's robot": ("beta", "Beta 14", {"reply": unguarded}),
+    "a channel that nobody declared": (
+        "beta",
+        "Beta 46",
+        {"reply": in_reply("set_user_channels_ok", put("applied", 1.0))},
+    ),
+    "no word of the channel": ("beta", "Beta 46", {"reply": in_reply("set_user_channels_ok", put("rejected", []))}),
+    "messages in direct mode": ("beta", "Beta 44", {"request": in_request("set_mode", put("mode", "live"))}),
+    "the topic of a step's snapshot": (ANY, "Transports 3.4", {"message": in_topic(b"state/full", b"state/part")}),
+    "a snapshot of another time": (ANY, "Transports 3.4", {"message": in_snapshot(each("time", lambda v: v + 99.0))}),
+    "a field that nobody knows": (ANY, "Beta 8", {"reply": unknown_fields}),
+    "the cameras of the scene": ("beta", "Beta 87", {"reply": in_reply("hello_ok", drop("global_cameras"))}),
+    "a camera's announced topic": (
+        ANY,
+        "Session 9.1.1",
+        {"reply": robots(lambda one: [it.update(zmq_topic="x") for it in one["camera_topics"].values()])},
+    ),
+    "a camera's angle": (
+        ANY,
+        "Session 9.1.1",
+        {"reply": robots(lambda one: [it.update(fovy=200.0) for it in one["camera_topics"].values()])},
+    ),
+}
+FALSIFIED |= {
+    f"{op} is refused, for another reason than {code} {fields or ''}": (
+        generation,
+        statement,
+        {"reply": refusal(op, code, **fields)},
+    )
+    for generation, statement, op, code, fields in (
+        (ANY, "Editor 3.1 create_level", "create_level", "create_level_failed", {}),
+        (ANY, "Editor 3.1 create_level", "create_level", "missing_field", {}),
+        (ANY, "Editor 3.1 import_xml", "import_xml", "import_failed", {}),
+        (ANY, "Editor 3.1 import_xml", "import_xml", "missing_field", {"path": None}),
+        (ANY, "Editor 3.1 import_xml", "import_xml", "missing_field", {"path": ""}),
+        (ANY, "Editor 3.1 destroy_actor", "destroy_actor", "destroy_failed", {}),
+        (ANY, "Editor 3.1 load_level", "load_level", "load_level_failed", {}),
+        ("beta", "Beta 4", "step", "not_control_owner", {}),
+        (ANY, "Beta 88", "step", "step_timeout", {}),
+        (ANY, "Session 9.9", "set_control_source", "bad_value", {}),
+        (ANY, "Session 9.9", "set_control_source", "missing_field", {}),
+        (ANY, "Session 9.10", "set_twist", "unknown_articulation", {}),
+        (ANY, "Session 9.10", "set_qpos", "unknown_articulation", {}),
+        (ANY, "Session 9.10", "set_qpos", "dim_mismatch", {}),
+        (ANY, "Session 9.12", "set_mocap_pose", "unknown_body", {}),
+        (ANY, "Session 9.12", "read_mocap_pose", "unknown_body", {}),
+        ("beta", "Beta 19", "release_control", "not_control_owner", {}),
+        ("beta", "Beta 19", "release_control", "unknown_articulation", {}),
+        ("beta", "Beta 19", "release_control", "missing_field", {}),
+        ("beta", "Beta 19", "set_qpos", "not_control_owner", {}),
+        ("beta", "Beta 19", "set_twist", "not_control_owner", {}),
+        ("beta", "Beta 19", "set_twist", "unknown_articulation", {}),
+        ("beta", "Generation 2 7", "op_status", "missing_field", {}),
+        ("beta", "Generation 2 7", "op_status", "bad_request", {}),
+        ("beta", "Generation 2 7", "op_status", "unknown_job", {"job_id": "job_999999"}),
+        ("beta", "Generation 2 7", "op_status", "session_expired", {}),
+    )
+}
+FALSIFIED |= {
+    f"{op} fails": (generation, statement, {"reply": failing(op)})
+    for generation, statement, op in (
+        (ANY, "Editor 3.1 snapshot", "snapshot"),
+        (ANY, "Editor 3.1 snapshot", "actor_hierarchy"),
+        (ANY, "Editor 3.1 snapshot", "list_blueprints"),
+        (ANY, "Editor 3.1 snapshot", "get_camera"),
+        ("beta", "Beta 22", "forward"),
+    )
 }
 
 PICTURES: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -402,6 +585,51 @@ PICTURES: dict[str, tuple[str, str, dict[str, Any]]] = {
             "request": in_request(
                 "set_camera_streaming", each("cameras", lambda v: {k: bool(one) for k, one in v.items()})
             )
+        },
+    ),
+    "a bare name that means a camera": (
+        "beta",
+        "Beta 48",
+        {"reply": in_reply("step_ok", lambda r: r.update(cameras=r.get("cameras") or {}))},
+    ),
+    "a live step without a picture": ("beta", "Beta 49", {"reply": InLive(drop("cameras"))}),
+    "a picture that is not drawn yet": (
+        "beta",
+        "Beta 52",
+        {"request": in_request("step", each("include_cameras", any_picture))},
+    ),
+    "a picture that can be had once": ("beta", "Generation 2 26", {"reply": earlier_cameras}),
+    "a camera that publishes while it is paused": (
+        "beta",
+        "Beta 55",
+        {"request": in_request("set_paused", put("paused", False))},
+    ),
+    "a delay that is not told": (
+        "beta",
+        "Beta 54",
+        {
+            "reply": in_reply(
+                "set_camera_delay_ok", lambda r: [one.update(delay_s=0.0) for one in r["cameras"].values()] and None
+            )
+        },
+    ),
+    "a delay without its clock": (
+        "beta",
+        "Beta 54",
+        {
+            "reply": in_reply(
+                "set_camera_delay_ok", lambda r: [one.pop("clock") for one in r["cameras"].values()] and None
+            )
+        },
+    ),
+    "a delay that is no delay": (
+        "beta",
+        "Beta 54",
+        {
+            "request": in_request("set_camera_delay", each("cameras", lambda v: dict.fromkeys(v, 0.0))),
+            "reply": in_reply(
+                "set_camera_delay_ok", lambda r: [one.update(delay_s=0.1) for one in r["cameras"].values()] and None
+            ),
         },
     ),
     "a stale picture": ("beta", "Beta 50", {"reply": pictures(each("frame_id", lambda v: v - 1))}),

@@ -101,8 +101,12 @@ async def bare_names(bench: Bench) -> None:
 @pictured("Beta 49", dialects=BETA)
 async def pictures_in_live(bench: Bench) -> None:
     """A live step brings a picture"""
+    await _fresh(bench, **_WAIT)  # it draws
     await bench.enter("live")
-    await _fresh(bench, **_WAIT)
+    for _ in range(5):
+        if (await _drawn(bench, **_WAIT))[1] is not None:
+            return
+    raise Differs("a picture", "none in five steps")
 
 
 @pictured("Beta 51", dialects=BETA)
