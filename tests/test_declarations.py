@@ -11,7 +11,7 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import msgspec
 import numpy as np
@@ -159,3 +159,21 @@ def test_every_logger_is_one_of_ours(package: str) -> None:
         for value in vars(module).values():
             if isinstance(value, logging.Logger):
                 assert value.name.startswith("urlab_client"), module.__name__
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_what_has_arrays_is_compared_by_identity(package: str) -> None:
+    """NumPy compares arrays value by value, so that `==` of what has some would raise."""
+
+    def has_arrays(annotation: Any) -> bool:
+        return get_origin(annotation) is np.ndarray or any(map(has_arrays, get_args(annotation)))
+
+    found = [
+        cls.__name__
+        for module in modules(package)
+        for cls in classes(module)
+        if issubclass(cls, msgspec.Struct)
+        and cls.__struct_config__.eq
+        and any(has_arrays(field.type) for field in struct_fields(cls))
+    ]
+    assert found == []

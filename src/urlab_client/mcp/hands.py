@@ -62,7 +62,7 @@ class Waypoint(Struct, frozen=True, forbid_unknown_fields=True):
     gripper: float | None = None
 
 
-class _Leg(Struct):
+class _Leg(Struct, eq=False):
     """The way to one pose: joint positions one after another, the seconds that each takes, and what to do there."""
 
     path: list[dict[str, float]]

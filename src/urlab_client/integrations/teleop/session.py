@@ -52,7 +52,7 @@ class TeleopCommand(Struct, frozen=True, kw_only=True):
         return any((*self.linear, *self.angular, self.gripper))
 
 
-class TeleopView(Struct, frozen=True, kw_only=True):
+class TeleopView(Struct, frozen=True, kw_only=True, eq=False):
     """What an operator sees in one period.
 
     Attributes:

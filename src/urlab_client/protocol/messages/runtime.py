@@ -121,7 +121,7 @@ class SetTwist(ControlRequest[SetTwistOk], tag="set_twist", kw_only=True):
     angular: Annotated[Vec3, doc("(ignored, ignored, yaw rate), rad/s, base frame.")] = (0.0, 0.0, 0.0)
 
 
-class SetQposOk(Reply, tag="set_qpos_ok", kw_only=True, omit_defaults=True):
+class SetQposOk(Reply, tag="set_qpos_ok", kw_only=True, omit_defaults=True, eq=False):
     """The written positions."""
 
     target: Annotated[str, doc("As requested.")]
@@ -131,7 +131,7 @@ class SetQposOk(Reply, tag="set_qpos_ok", kw_only=True, omit_defaults=True):
     free_base_shortcut: Annotated[bool, doc("True if only the free base was written.")]
 
 
-class SetQpos(ControlRequest[SetQposOk], tag="set_qpos", kw_only=True):
+class SetQpos(ControlRequest[SetQposOk], tag="set_qpos", kw_only=True, eq=False):
     """Write joint positions of an articulation and run `mj_forward`. Velocities and time do not change."""
 
     target: Annotated[str, doc("Actor id, or the articulation key with `by_name`.")]

@@ -59,7 +59,7 @@ class BodyPose(Serializable, Struct, kw_only=True):
     xquat: QuatWXYZ
 
 
-class ArticulationState(Serializable, Struct, kw_only=True, omit_defaults=True):
+class ArticulationState(Serializable, Struct, kw_only=True, omit_defaults=True, eq=False):
     """State of one articulation. Arrays follow its joints or actuators in ascending MuJoCo id."""
 
     qpos: Annotated[Floats, doc("Joint positions, shape (nq of the articulation,).")]
@@ -90,7 +90,7 @@ class ArticulationState(Serializable, Struct, kw_only=True, omit_defaults=True):
     actions: Annotated[int | None, doc("Bit field of pressed action keys, bits 0 to 9.")] = None
 
 
-class EntityState(Serializable, Struct, kw_only=True, omit_defaults=True):
+class EntityState(Serializable, Struct, kw_only=True, omit_defaults=True, eq=False):
     """State of one dynamic body outside any articulation."""
 
     xpos: Annotated[Vec3, doc("Position, metres, world frame.")]
@@ -121,7 +121,7 @@ def _pixels(frame: CameraFrame) -> tuple[Pixels, CameraMode]:
     return decode_camera(frame.data, mode, frame.width, frame.height).pixels, mode
 
 
-class Perturbation(Serializable, Struct, kw_only=True):
+class Perturbation(Serializable, Struct, kw_only=True, eq=False):
     """A mouse drag in the editor's viewport."""
 
     body_id: Annotated[int, doc("MuJoCo body id, above 0.")]
@@ -209,7 +209,7 @@ CameraChoice: TypeAlias = bool | Mapping[str, str | dict[str, float] | None]
 """Pictures that a step requests: all or none, or camera name to the kind of picture."""
 
 
-class Step(ControlRequest[StepOk], tag="step", kw_only=True, forbid_unknown_fields=True):
+class Step(ControlRequest[StepOk], tag="step", kw_only=True, forbid_unknown_fields=True, eq=False):
     """Advance physics, or exchange state, according to the step mode."""
 
     n_steps: Annotated[Int32, doc("Sub-steps; values below 1 count as 1. Direct only.")] = 1
