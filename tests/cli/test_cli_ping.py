@@ -165,3 +165,4 @@ def test_the_registry_is_listed(
         text = capsys.readouterr().out
         assert f"bench  tcp://127.0.0.1:{server.step_port}" in text
         assert "does not answer" in text
+        assert "in use" not in text

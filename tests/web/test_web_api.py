@@ -156,6 +156,8 @@ def test_openapi_describes_parameters_bodies_and_responses(http: TestClient) -> 
                 "/api/invitations",
             }
         )
+    assert operations["post", "/api/run"]["requestBody"]["required"]
+    assert not operations["post", "/api/step"]["requestBody"]["required"], "one step without"
     for path in ("world", "status", "log", "state", "bodies", "bodies/{id}", "explain", "recordings"):
         told = operations["get", f"/api/{path}"]["responses"]["200"]["content"]["application/json"]["schema"]
         validator = Draft202012Validator({**told, "components": document["components"]})
