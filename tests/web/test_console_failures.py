@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ports import free_ports
 from starlette.applications import Starlette
 from starlette.routing import Mount
 from waiting import DEADLINE_S, until
@@ -26,7 +27,7 @@ from urlab_client.console.replay import Replay
 from urlab_client.console.session import ConsoleSession
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
-from urlab_client.errors import ServerUnreachable
+from urlab_client.errors import ServerUnreachable, SessionTakenOver
 from urlab_client.integrations.record import record
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Reset, ResetOk
@@ -294,6 +295,65 @@ async def test_after_a_reset_a_controller_keeps_the_pose_of_the_start(mode: str,
             await until(lambda: (shown_targets(console, "quadruped")[1:2] or [0.0])[0] > 0.4)
             await console.controls.do(ME, Reset())
             assert client.articulations["quadruped"].actuators["FL_thigh"].value == pytest.approx(start, abs=0.002)
+
+
+@pytest.mark.parametrize("held", [True, False], ids=["held", "driven"])
+async def test_set_points_are_not_sent_to_a_server_that_was_started_again(held: bool, tmp_path: Path) -> None:
+    """Its controller takes the torques that held a pose, or a viewer's, for angles."""
+    ports = free_ports()
+    pd = {"quadruped": ControllerConfig(kp=40.0, kv=1.5)}
+    with SimulatedServer("quadruped", play=True, **ports) as server:
+        async with connected(server, tmp_path, "direct") as (client, console):
+            await until(lambda: console.view.snapshot is not None)
+            if held:
+                await console.controls.hold(ME, "quadruped", True)
+            else:
+                console.controls.set_points(ME, {"quadruped": {"FL_thigh": 8.0}})
+            await console.controls.step(ME, 100)
+            robot, session = client.articulations["quadruped"], client.session_id
+            assert abs(robot.ctrl_array).max() > 5.0
+            server.close()
+            with SimulatedServer("quadruped", play=True, controllers=pd, **ports):
+                await until(lambda: client.session_id != session and console.link.state == "connected")
+                await until(lambda: abs(robot.ctrl_array).max() < 3.0)
+                await until(lambda: console.view.snapshot is not None and console.view.snapshot.time < 0.1)
+                await console.controls.step(ME, 1)
+                assert list(console.controls.holding) == []
+                assert robot.ctrl_array.tolist() == pytest.approx(robot.dof_qpos.tolist(), abs=0.05)
+
+
+async def test_a_robot_that_was_held_is_held_again_in_a_session_that_is_taken_back(tmp_path: Path) -> None:
+    with SimulatedServer("quadruped", play=True) as server:
+        async with connected(server, tmp_path, "direct") as (client, console):
+            await until(lambda: console.view.snapshot is not None)
+            await console.controls.hold(ME, "quadruped", True)
+            await console.controls.step(ME, 100)
+            async with URLabClient(**server.client_options(), step_mode="direct") as other:
+                await other.discover()
+                other.articulations["quadruped"].set_ctrl({"FL_thigh": 8.0, "RR_calf": 3.0})
+                await other.step(5)
+                with contextlib.suppress(SessionTakenOver):
+                    await client.runtime.forward()
+                await until(lambda: console.link.state == "taken_over")
+                assert console.status(ME).holding == [], "in the steps of the other program nothing holds it"
+            console.reconnect()
+            await until(lambda: console.link.state == "connected")
+            assert console.status(ME).holding == ["quadruped"]
+            await console.controls.step(ME, 2000)
+            assert console.status(ME).holding == ["quadruped"]
+            assert client.articulations["quadruped"].root_pos_w[2] > 0.28
+
+
+async def test_the_torques_of_a_hold_end_with_it(tmp_path: Path) -> None:
+    with SimulatedServer("quadruped", play=True) as server:
+        async with connected(server, tmp_path, "direct") as (client, console):
+            await until(lambda: console.view.snapshot is not None)
+            robot = client.articulations["quadruped"]
+            await console.controls.hold(ME, "quadruped", True)
+            await console.controls.step(ME, 100)
+            robot.set_ctrl({"FL_thigh": 1.0})  # by the program around it
+            await console.controls.step(ME, 1)
+            assert {name: one.value for name, one in robot.actuators.items() if one.value} == {"FL_thigh": 1.0}
 
 
 async def test_posing_takes_time_so_that_it_can_be_recorded(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -93,6 +94,7 @@ class Controls:
         source: The control source, if a viewer has chosen it.
         twists: Commanded velocities by articulation: x, y, yaw.
         holding: The robots that hold their home pose, until set-points come for them.
+        chosen_mode: The step mode that a viewer has chosen last.
     """
 
     def __init__(
@@ -109,6 +111,7 @@ class Controls:
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
         self.holding: dict[str, _PoseHold] = {}
+        self.chosen_mode: StepMode | None = None
         self._client = client
         self._lease = lease
         self._view = view
@@ -116,25 +119,43 @@ class Controls:
         self._before_step = before_step
         self._wake_runner = asyncio.Event()
         self._seeded: dict[str, list[float]] = {}  # with which set-points a robot was kept as it was
-        self._driven: dict[str, str] = {}  # the session in which viewers gave a robot set-points
+        self._driven: set[str] = set()  # by viewers
+        self._session = ""  # in which all of this was
         self._pending: set[str] = set()
         self._commanded = asyncio.Event()
         self._pictures_due = 0.0
         self._halted = False  # by a viewer, since a number of steps began
 
-    def begin_anew(self, *, ended: bool) -> None:
-        """Discard the state of the previous play session; its set-points would drive the robots of the next.
+    def begin_anew(self, *, ended: bool = False) -> None:
+        """Discard the set-points of an earlier session or play session, which would drive the robots of the next.
+
+        Another controller may take them for something else: torques for angles. A robot that was held is held on, if
+        it still can be.
 
         Args:
-            ended: Whether it is the one that still was; otherwise set-points may have come for the next already.
+            ended: Whether play has ended.
         """
-        for key, session in [*self._driven.items()]:
-            if ended or session != self._client.session_id:
-                self._forget(key)
         self._suspended = False
+        if not ended and self._session == self._client.session_id:
+            return  # set-points may have come for it already
+        self._session = self._client.session_id
+        held, robots = [*self.holding], self._client.articulations
+        for key in {*self._seeded, *held}:
+            if key in robots and self._wrote(key, robots[key]):
+                self._forget(key)
+        self._driven.clear()
+        self._pending.clear()
         self._seeded.clear()
         self.twists.clear()
         self.holding.clear()
+        if not ended and self._client.step_mode is StepMode.DIRECT:
+            for key in held:
+                with contextlib.suppress(KeyError, ValueError):
+                    self.holding[key] = _PoseHold(self._client.model, robots[key])
+
+    def _wrote(self, key: str, art: URLabArticulation) -> bool:
+        """Return whether the set-points of a robot are the console's, not those of the program around it."""
+        return key in self._driven or key in self.holding or self._seeded.get(key) == art.ctrl_array.tolist()
 
     def commands(self, key: str) -> bool:
         """Return whether a viewer has commanded this articulation since play began."""
@@ -171,8 +192,9 @@ class Controls:
                 self.source = reply.source
             case SetTwist():
                 self.twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
-            case SetMode() if reply.current_mode != StepMode.DIRECT:
-                for key in [*self.holding]:
+            case SetMode():
+                self.chosen_mode = StepMode(reply.current_mode)
+                for key in [*self.holding] if self.chosen_mode is not StepMode.DIRECT else ():
                     self._let_go(viewer, key)
             case Reset():
                 self._start_again(reply)
@@ -189,8 +211,7 @@ class Controls:
                 continue
             # What a controller makes of the set-points from before may be in the state: it is to keep the pose instead.
             start = start if art.controller is None else structs.replace(start, ctrl=None)  # noqa: PLW2901
-            ours = key in self._driven or self._seeded.get(key) == art.ctrl_array.tolist()
-            if not ours and not self._inherited(key, art, start):
+            if not self._wrote(key, art) and not self._inherited(key, art, start):
                 continue
             self._forget(key)
             _keep(art, start)
@@ -209,7 +230,7 @@ class Controls:
 
     def _forget(self, key: str) -> None:
         """Discard a robot's set-points."""
-        self._driven.pop(key, None)
+        self._driven.discard(key)
         self._pending.discard(key)
         if art := self._client.articulations.get(key):
             art.ctrl_array[:] = 0.0
@@ -225,11 +246,12 @@ class Controls:
             for name in given:
                 art.actuators[name]  # raises
         self._lease.use(viewer)
+        self.begin_anew()
         for key, art, given in found:
             self._let_go(viewer, key)
             self._seed(key, art)
             art.set_ctrl(given)
-            self._driven[key] = self._client.session_id
+            self._driven.add(key)
             self._pending.add(key)
             if noted and given:
                 self._view.note_burst(viewer.name, "set-points", key, given)
@@ -241,6 +263,7 @@ class Controls:
         A law that balances a robot must not be late, so this needs direct mode, and chooses it.
         """
         key = self._client.articulations.key(name)
+        self.begin_anew()
         if holding:
             hold = _PoseHold(self._client.model, self._client.articulations[key])
             if self._client.step_mode is not StepMode.DIRECT:
@@ -266,6 +289,8 @@ class Controls:
         free = not art.ctrl_array.any()  # of commands by the program around the console
         if free:
             _keep(art, state)
+            if key in self.holding:
+                self.holding[key].note_written()
         self._seeded[key] = art.ctrl_array.tolist() if free else []
 
     async def send_set_points(self) -> None:
@@ -298,6 +323,7 @@ class Controls:
         return await self._step(n_steps)
 
     async def _step(self, n_steps: int) -> SteppedTo:
+        self.begin_anew()
         for key, art in self._client.articulations.items():
             self._seed(key, art)
         while True:
@@ -413,22 +439,28 @@ class _PoseHold:
         self._home = home_of(model, art)[model.jnt_qposadr[driven]]
         strength = model.actuator_gainprm[driving, 0] * model.actuator_gear[driving, 0]
         self._per_acceleration = model.dof_M0[model.jnt_dofadr[driven]] / strength
-        self._written = art.ctrl_array[self._ctrl]
+        self.note_written()
+
+    def note_written(self) -> None:
+        """Take the set-points of the motors for those of the hold."""
+        self._written = self._art.ctrl_array[self._ctrl]
 
     def renew(self) -> bool:
         """Write the set-points of the next period, unless somebody else has; return whether they are written."""
         ctrl = self._art.ctrl_array
         if (ctrl[self._ctrl] != self._written).any():
+            self.let_go()
             return False
         error, velocity = self._home - self._art.qpos_array[self._qpos], self._art.qvel_array[self._qvel]
         acceleration = _FREQUENCY**2 * error - 2 * _DAMPING * _FREQUENCY * velocity
         ctrl[self._ctrl] = self._per_acceleration * acceleration  # physics clamps it
-        self._written = ctrl[self._ctrl]
+        self.note_written()
         return True
 
     def let_go(self) -> None:
-        """End the torques."""
-        self._art.ctrl_array[self._ctrl] = 0.0
+        """End the torques, except those that somebody else has written since."""
+        ctrl = self._art.ctrl_array
+        ctrl[self._ctrl] = np.where(ctrl[self._ctrl] == self._written, 0.0, ctrl[self._ctrl])
 
 
 def _turns(model: mujoco.MjModel | None, art: URLabArticulation, actuator: Actuator) -> bool:

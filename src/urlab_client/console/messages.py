@@ -134,9 +134,9 @@ class ReplayView(Struct):
 class Status(Struct, tag_field="type", tag="status"):
     """Connection, play, time, recording, replay and driver, from one viewer's view; sent whenever it changes.
 
-    `rate` is simulation time relative to real time, `speed` the pacing of live mode in percent, `holding` the robots
-    that hold their home pose, `mine` whether this viewer drives, and `lease_left` for how many seconds the driver keeps
-    the controls without using them.
+    `rate` is simulation time relative to real time, `mode_chosen` whether a viewer has chosen the mode, `speed` the
+    pacing of live mode in percent, `holding` the robots that hold their home pose, `mine` whether this viewer drives,
+    and `lease_left` for how many seconds the driver keeps the controls without using them.
     """
 
     link: Link
@@ -146,6 +146,7 @@ class Status(Struct, tag_field="type", tag="status"):
     running: bool
     rate: float
     mode: StepMode
+    mode_chosen: bool
     speed: float | None
     source: str | None
     recording: RunningRecording | None

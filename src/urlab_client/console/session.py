@@ -397,8 +397,9 @@ class ConsoleSession:
 
     def _present_status(self) -> Status:
         client, controls, replay, holder = self.client, self.controls, self.replay, self.lease.holder
+        link = self.link
         return Status(
-            link=self.link,
+            link=link,
             address=client.address,
             playing=client.manager_present,
             moving=replay.rate > 0 if replay.open else self.moving,
@@ -411,7 +412,9 @@ class ConsoleSession:
             conversions=[structs.replace(conversion) for conversion in self.recordings.conversions],
             replay=replay.view,
             twists=dict(controls.twists),
-            holding=list(controls.holding),
+            mode_chosen=client.step_mode is controls.chosen_mode,
+            # Nothing holds them in steps of another program, and none are made in other modes.
+            holding=[*controls.holding] if client.step_mode is StepMode.DIRECT and link.state != "taken_over" else [],
             viewers=len(self.viewers),
             driver=None if holder is None else holder.name,
             mine=False,
