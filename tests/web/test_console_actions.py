@@ -22,6 +22,7 @@ from urlab_client.console.lease import Viewer
 from urlab_client.console.mujoco_viewer import MujocoViewer
 from urlab_client.console.session import ConsoleSession
 from urlab_client.console.shared_view import SharedView
+from urlab_client.enums import StepMode
 from urlab_client.errors import (
     ConnectionLost,
     ModeLocked,
@@ -32,6 +33,7 @@ from urlab_client.errors import (
     URLabTimeoutError,
 )
 from urlab_client.integrations.record import record
+from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app, endpoints
 from urlab_client.web.endpoints import explain_error
@@ -230,6 +232,18 @@ def test_physics_that_runs_goes_on_while_a_robot_begins_to_hold_its_pose(http: T
     http.post("/api/hold", json={"quadruped": False})
     assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
     assert not status()["running"], "what stood still does not begin by itself"
+
+
+async def test_the_status_says_whether_a_viewer_has_chosen_the_mode(tmp_path: Path) -> None:
+    async with SimulatedServer("quadruped", play=True) as server, URLabClient(**server.client_options()) as client:
+        await client.discover()
+        console, viewer = ConsoleSession(client, recordings=tmp_path), Viewer("key", "me")
+        assert (console.status(viewer).mode, console.status(viewer).mode_chosen) == ("live", False)
+        for mode in (StepMode.DIRECT, StepMode.LIVE):
+            await console.controls.do(viewer, SetMode(mode=mode))
+            assert (console.status(viewer).mode, console.status(viewer).mode_chosen) == (mode, True)
+        await client.runtime.set_mode(StepMode.DIRECT)  # by the program around it
+        assert not console.status(viewer).mode_chosen
 
 
 ARM = """<mujoco><worldbody><body name="upper"><joint name="turn" axis="0 1 0"/><geom size="0.1" fromto="0 0 0 1 0 0"/>

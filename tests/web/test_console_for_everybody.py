@@ -43,15 +43,21 @@ ROCK = """<mujoco><asset><mesh name="rock" file="meshes/rock.obj"/></asset><worl
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """A page before a quadruped with torque motors and an arm, which stand still."""
+    with first_page(tmp_path_factory.mktemp("page"), tmp_path_factory.mktemp("recordings")) as one:
+        yield one
+
+
+@contextlib.contextmanager
+def first_page(profile: Path, folder: Path) -> Iterator[Page]:
+    """Open a page before robots that nobody has driven yet."""
     ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
     with contextlib.ExitStack() as stack:
         robots = ("quadruped", "arm", "--play", "--camera-size", "64x48")
         _, line = stack.enter_context(command("serve", *robots, "--json", *ports))
         ready = json.loads(line)
         ours = [f"--step-port={ready['step_port']}", f"--state-port={ready['state_port']}", "--port=0"]
-        folder = tmp_path_factory.mktemp("recordings")
         _, said = stack.enter_context(command("console", ready["address"], *ours, f"--recordings={folder}"))
-        one = stack.enter_context(opened(tmp_path_factory.mktemp("page"), link_in(said)))
+        one = stack.enter_context(opened(profile, link_in(said)))
         one.until(
             f"document.querySelector('{SLIDER}') !== null && document.querySelector('#time').textContent.includes('s')"
         )
@@ -379,17 +385,103 @@ def test_panels_are_moved_by_keys_and_by_the_mouse_and_stay_there(still: Page) -
     assert still.look(PANELS) == first
 
 
-def test_the_first_play_leaves_a_robot_with_torque_motors_standing(still: Page) -> None:
+def test_play_keeps_a_mode_that_somebody_has_chosen(still: Page) -> None:
+    said, button = (f"document.querySelector('[data-robot=quadruped] .still {part}')" for part in ("span", "button"))
+    for mode in ("direct", "live"):
+        still.choose("#mode", mode)
+        still.asked("api/status", lambda status, mode=mode: status["mode"] == mode and status["mode_chosen"])
+    still.until(f"{said}.textContent.startsWith('Nothing drives it, so it falls in mode live. “Hold pose” chooses')")
+    still.click("#play")
+    still.until(f"{said}.textContent.startsWith('It has fallen.')")
+    assert still.look("document.querySelector('#mode').value") == "live"
+    still.click("#stop")
+    still.until(f"!({RUNNING})")
+    still.ask("api/ops/reset", {})
+    still.until(f"{button}.textContent === 'Hold pose'")
+    still.look(f"{button}.click()")
+    still.until("document.querySelector('#toasts').textContent.includes('The mode is now direct, not live')")
+    still.until("document.querySelector('#mode').value === 'direct'")
+
+
+def test_why_it_does_not_move_names_first_what_keeps_all_from_moving(still: Page) -> None:
+    def findings() -> list[str]:
+        still.click("[data-robot=quadruped] .why")
+        still.until("document.querySelector('#findings').open")
+        found: list[str] = still.look("[...document.querySelectorAll('#findings li')].map((one) => one.textContent)")
+        still.driver.execute_script("document.querySelector('#findings').close()")
+        return found
+
+    still.ask("api/ops/set_mode", {"mode": "live"})
+    still.ask("api/ops/set_paused", {"paused": True})
+    still.until("document.querySelector('#mode').value === 'live'")
+    still.until("document.querySelector('#age').textContent === 'paused'")
+    assert findings()[0].startswith("Physics Physics stands still")
+    still.ask("api/hold", {"quadruped": True})
+    still.until("document.querySelector('[data-robot=quadruped] .still').textContent.startsWith('It holds')")
+    assert findings() == [
+        "Physics Nothing steps it now. Press Play.",
+        "quadruped It holds its home pose as soon as physics runs.",
+    ]
+    still.ask("api/hold", {"quadruped": False})
+    still.ask("api/ops/set_mode", {"mode": "live"})
+
+
+def test_the_same_message_shows_once(still: Page) -> None:
+    still.driver.execute_async_script(
+        "const done = arguments[0]; import('/static/dom.js').then(({toast}) => {"
+        "document.querySelector('#toasts').replaceChildren();"
+        "for (const one of ['a', 'b', 'a', 'a']) toast(one); done(); })"
+    )
+    assert still.look("[...document.querySelectorAll('.toast')].map((one) => one.textContent)") == ["b", "a"]
+
+
+def test_what_has_the_focus_is_not_behind_the_bar(still: Page) -> None:
+    behind: list[str] = []
+
+    def back(edge: str) -> None:
+        still.driver.execute_script(
+            "window.scrollTo(0, document.body.scrollHeight); document.querySelector('#contacts summary').focus()"
+        )
+        for _ in range(60):
+            ActionChains(still.driver).key_down(Keys.SHIFT).send_keys(Keys.TAB).key_up(Keys.SHIFT).perform()
+            behind.extend(
+                still.look(
+                    "((one) => one.closest('main') && !one.matches('.grip') && "
+                    f"one.getBoundingClientRect().top < {edge} ? [one.outerHTML] : [])(document.activeElement)"
+                )
+            )
+
+    back("document.querySelector('#bar').getBoundingClientRect().bottom")
+    assert behind == []
+    with still.phone():
+        still.driver.execute_script("window.scrollTo(0, 0); document.querySelector('#view summary').focus()")
+        edge = "document.querySelector('.controls').getBoundingClientRect().top"
+        for _ in range(30):
+            ActionChains(still.driver).send_keys(Keys.TAB).perform()
+            behind.extend(
+                still.look(
+                    "((one) => one.closest('.wide') && "
+                    f"one.getBoundingClientRect().bottom > {edge} ? [one.outerHTML] : [])(document.activeElement)"
+                )
+            )
+    assert behind == []
+
+
+def test_the_first_play_leaves_a_robot_with_torque_motors_standing(tmp_path: Path) -> None:
+    with first_page(tmp_path / "page", tmp_path / "recordings") as page:
+        stays_standing(page)
+
+
+def stays_standing(still: Page) -> None:
     def height(state: Any) -> float:
         return float(state["articulations"]["quadruped"]["qpos"][2])
 
-    # As nobody has commanded it since play began.
-    still.ask("api/ops/stop_pie", {})
-    still.ask("api/ops/begin_pie", {})
-    still.until(f"document.querySelector('{SLIDER}') !== null")
-    still.until("document.querySelector('[data-robot=quadruped] .still')?.textContent.includes('Play makes it hold')")
+    still.until(
+        "document.querySelector('[data-robot=quadruped] .still')?.textContent.includes('and chooses mode direct')"
+    )
     before = still.look(TOP)
     still.click("#play")
+    still.until("document.querySelector('#toasts').textContent.includes('The mode is now direct, not live')")
     still.asked("api/state", lambda state: state["time"] > 0.7)
     assert height(still.ask("api/state")) > 0.25
     hold = "document.querySelector('[data-robot=quadruped] .still button').getAttribute('aria-pressed')"

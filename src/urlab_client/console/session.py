@@ -397,7 +397,7 @@ class ConsoleSession:
 
     def _present_status(self) -> Status:
         client, controls, replay, holder = self.client, self.controls, self.replay, self.lease.holder
-        link = self.link
+        link, mode = self.link, client.step_mode
         return Status(
             link=link,
             address=client.address,
@@ -405,16 +405,16 @@ class ConsoleSession:
             moving=replay.rate > 0 if replay.open else self.moving,
             running=self.running,
             rate=replay.rate if replay.open else round(self._clock.rate, 3) if self.moving else 0.0,
-            mode=client.step_mode,
+            mode=mode,
+            mode_chosen=mode is controls.chosen_mode,
             speed=controls.speed,
             source=controls.source,
             recording=self.recordings.running,
             conversions=[structs.replace(conversion) for conversion in self.recordings.conversions],
             replay=replay.view,
             twists=dict(controls.twists),
-            mode_chosen=client.step_mode is controls.chosen_mode,
-            # Nothing holds them in steps of another program, and none are made in other modes.
-            holding=[*controls.holding] if client.step_mode is StepMode.DIRECT and link.state != "taken_over" else [],
+            # In other modes, and in the steps of another program, nothing holds them.
+            holding=[*controls.holding] if mode is StepMode.DIRECT and link.state != "taken_over" else [],
             viewers=len(self.viewers),
             driver=None if holder is None else holder.name,
             mine=False,

@@ -119,7 +119,7 @@ export function actuatorTable(group, rows) {
   return h("div", { class: "table actuators" },
     h("div", { class: "line head" },
       h("span", { class: "name" }, `${FORCES[group.unit] ?? MEANINGS[group.takes]}${group.unit ? ` · ${group.unit}` : ""}`),
-      h("span", {}, "set-point"), h("span", {}, "command"), h("span", { class: "right" }, rows.some((row) => row.joint) ? "measured" : "applied"),
+      h("span", {}, "set-point"), h("span", {}, "command"), h("span", { class: "right" }, !rows.some((row) => row.joint) ? "applied" : group.takes === "position" ? "measured" : "joint"),
       h("span", { class: "few" },
         h("button", { class: "tiny", title: "All to 0", "aria-label": "All to 0", onclick: () => act("zero") }, "0"),
         h("button", { class: "tiny", title: "All home", "aria-label": "All home", onclick: () => act("home") }, "⌂"))),
@@ -148,21 +148,25 @@ export function fallen(art, state) {
   return z < 0.6 * art.height || 1 - 2 * (x * x + y * y) < 0.5;
 }
 
+/** Whether Play keeps a mode in which the console cannot hold a pose, because somebody has chosen it. */
+export const staysInMode = (status) => status?.mode_chosen && status.mode !== "direct";
+
 /** What holds a robot, or the reason why it does not move, as far as its state shows it; or an empty string. */
 export function stillness(art, state, status) {
-  if (status?.replay) return "";
+  if (status?.replay || status?.link.state === "taken_over") return "";
   if (status?.mode === "puppet") return "In mode puppet no physics runs. Place its joints below" + (free(art) ? ", or push it in the view." : ".");
-  if (status?.holding.includes(art.key) && fallen(art, state)) return "It holds its home pose, but has fallen. Press Reset to.";
-  if (status?.holding.includes(art.key)) return `It holds its home pose ${status.moving ? "until you move a slider" : "as soon as physics runs"}.`;
   if (!art.actuators.length) return "It has no actuators: only gravity and contacts move it.";
   if (status?.source === "ui") return "The editor's panel drives it. To use the set-points from here, choose those of “programs” in the bar.";
+  if (status?.holding.includes(art.key) && fallen(art, state)) return "It holds its home pose, but has fallen. Press Reset to.";
+  if (status?.holding.includes(art.key)) return `It holds its home pose ${status.moving ? "until you move a slider" : "as soon as physics runs"}.`;
   const limits = Object.values(art.controller?.params.torque_limit ?? {});
   if (limits.length && limits.every((limit) => limit === 0)) return "Its torque limits are 0, so nothing drives it. Raise them under “Gains”.";
   const forces = art.actuators.filter((actuator) => actuator.takes === "force");
   if (canHold(art) && fallen(art, state)) return "It has fallen. “Reset and hold” stands it up.";
   if (forces.length === art.actuators.length && forces.every((actuator) => !given(actuator, state))) {
     if (limp(art, state) && status?.moving) return "Nothing drives it, so it falls. “Hold pose” makes it stand.";
-    return limp(art, state) ? "Nothing drives it yet. Play makes it hold its pose."
+    if (limp(art, state) && staysInMode(status)) return `Nothing drives it, so it falls in mode ${status.mode}. “Hold pose” chooses direct, and makes it stand.`;
+    return limp(art, state) ? `Nothing drives it yet. Play makes it hold its pose${status?.mode === "direct" ? "" : ", and chooses mode direct for that"}.`
       : "Nothing drives it: all its forces are 0. Move a slider, or run a policy.";
   }
   return canHold(art) && free(art) ? "Set-points drive it. “Hold pose” takes over." : "";

@@ -60,10 +60,8 @@ export async function toggleRun() {
   if (now.status?.replay) toggleReplay();
   else if (now.status) {
     const { running } = now.status;
-    const { mode } = now.status;
-    const held = running ? [] : await steady();
+    if (!running) await steady();
     await run(!running);
-    if (mode === "live" && held.length) toast(`Mode direct was chosen, in which ${held.join(", ")} can hold a pose.`, "good");
   }
 }
 
@@ -109,7 +107,7 @@ export function makeBar() {
     ...Object.entries(MODES).map(([mode, what]) => h("option", { title: what }, mode)));
   ui.source = h("select", { id: "source", "aria-label": "Whose set-points drive", title: "Whose set-points drive the robots: those of programs and this console, or those of the editor's panel",
     onchange: () => ui.source.value && op("set_control_source", { source: ui.source.value }) },
-    h("option", { value: "", hidden: true }, "as it is"), h("option", { value: "zmq" }, "programs"), h("option", { value: "ui" }, "editor panel"));
+    h("option", { value: "", hidden: true }, "not chosen"), h("option", { value: "zmq" }, "programs"), h("option", { value: "ui" }, "editor panel"));
   ui.speed = h("input", { id: "speed", type: "range", min: 5, max: 100, step: 5, value: 100, "aria-label": "Speed, percent of real time", title: "How fast physics runs in live mode, percent of real time",
     onchange: () => op("set_sim_speed", { percent: +ui.speed.value }), oninput: () => text(ui.speedText, `${ui.speed.value} %`) });
   ui.speedText = h("span", { class: "num" }, "100 %");
@@ -143,6 +141,8 @@ export function makeBar() {
         h("button", { id: "invite", class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
       h("button", { id: "keys", class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
     h("div", { class: "row controls acts" }, ui.play, ui.stop, ui.sheet, ui.more));
+  const root = document.documentElement.style;
+  new ResizeObserver(([{ target }]) => root.setProperty("--bar", `${target.offsetHeight}px`)).observe($("bar"));
   const place = () => (PHONE.matches ? $("sheet").prepend(ui.more) : document.querySelector(".controls").append(ui.more));
   PHONE.addEventListener("change", place);
   place();
@@ -204,6 +204,8 @@ function show(status) {
     text(ui.speedText, `${Math.round(status.speed)} %`);
   }
   text(ui.others, status.viewers > 1 ? ` · ${status.viewers} viewers` : "");
+  ui.driver.title = status.driver === null ? "Whoever acts first gets the controls"
+    : `${status.mine ? "You lose" : `${status.driver} loses`} the controls at 0 s; each action begins anew at ${Math.round(status.lease)} s`;
   text(ui.who, status.driver === null ? "no driver"
     : `${status.mine ? "you drive" : `${status.driver} drives`} · ${Math.ceil(status.lease_left)} s`);
   ui.driver.dataset.who = status.mine ? "me" : status.driver === null ? "free" : "other";

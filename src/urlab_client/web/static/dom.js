@@ -102,7 +102,9 @@ export function fullScreenButton(of, shown) {
 /** Tell a screen reader what changed. */
 export const announce = (message) => text($("announcements"), message);
 
+/** Show a message for a while; one that is shown already stays for longer. */
 export function toast(message, kind = "error") {
+  [...$("toasts").children].find((one) => one.textContent === message)?.remove();
   const box = h("div", { class: `toast ${kind}` }, message);
   $("toasts").append(box);
   setTimeout(() => box.remove(), 6000);

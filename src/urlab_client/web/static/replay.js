@@ -57,10 +57,6 @@ function keys(event) {
 
 export function makeReplay() {
   $("replay").append(h("span", { class: "tag" }, "Replay"), name, damage, play, line, where, pace, placing, end);
-  // Stick below the bar if that is sticky, so that both stay visible while the user scrolls.
-  new ResizeObserver(() => {
-    $("replay").style.top = getComputedStyle($("bar")).position === "sticky" ? `${$("bar").offsetHeight}px` : "0";
-  }).observe($("bar"));
   on("status", (status) => {
     replay = status.replay;
     $("replay").hidden = replay === null;

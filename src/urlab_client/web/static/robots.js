@@ -1,8 +1,8 @@
 // Articulations: joint positions against their ranges, actuator sliders, gains, commanded twist.
 
-import { ActuatorRow, Setting, UNKNOWN, actuatorTable, canHold, fallen, groups, limp, share, stillness } from "./actuators.js";
+import { ActuatorRow, Setting, UNKNOWN, actuatorTable, canHold, fallen, groups, limp, share, staysInMode, stillness } from "./actuators.js";
 import { now, reset } from "./bar.js";
-import { $, h, heading, number, text } from "./dom.js";
+import { $, h, heading, number, text, toast } from "./dom.js";
 import { ask, newest, on, op } from "./link.js";
 
 let robots = [];
@@ -41,7 +41,7 @@ class Robot {
   async toggle() {
     const holding = this.hold.getAttribute("aria-pressed") === "true";
     const lies = !holding && fallen(this.art, now.state?.articulations[this.key]);
-    if ((await hold(this.key, !holding)) !== null && lies) await reset();
+    if ((await hold([this.key], !holding)) !== null && lies) await reset();
   }
 
   actuator(actuator, art) {
@@ -150,13 +150,19 @@ class Robot {
   }
 }
 
-const hold = (articulation, holding) => ask("POST", "api/hold", { [articulation]: holding });
+/** Let robots hold their home pose, or let go; say so if that changes the mode. */
+async function hold(keys, holding) {
+  const { mode } = now.status;
+  const answer = await ask("POST", "api/hold", Object.fromEntries(keys.map((key) => [key, holding])));
+  if (answer !== null && holding && mode !== "direct") toast(`The mode is now direct, not ${mode}, because ${keys.join(", ")} can hold a pose only in direct.`, "good");
+  return answer;
+}
 
 /** Before physics runs: make those robots hold their pose that would collapse, unless the editor's panel drives them. */
 export async function steady() {
-  const held = robots.filter((robot) => now.status.source !== "ui" && limp(robot.art, now.state?.articulations[robot.key]) && !now.status.holding.includes(robot.key)).map((robot) => robot.key);
-  await Promise.all(held.map((key) => hold(key, true)));
-  return held;
+  if (now.status.source === "ui" || staysInMode(now.status)) return;
+  const held = robots.filter(({ art, key }) => limp(art, now.state?.articulations[key]) && !now.status.holding.includes(key)).map(({ key }) => key);
+  if (held.length) await hold(held, true);
 }
 
 const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
@@ -170,6 +176,13 @@ const PRESS = [
   [/Call sim\.start\(\)\./, "Press Begin play."],
   [/Raise it with set_gains\(\)\./, "Raise it under “Gains”."],
 ];
+
+/** What the client examines, in words of this page. */
+const ABOUT = { RPC: "Connection", play: "Physics", steps: "Step mode", articulations: "Robots" };
+const wordFor = (subject) => ABOUT[subject] ?? (robots.find(({ key }) => key === subject)?.art.actor_id || subject[0].toUpperCase() + subject.slice(1));
+
+/** Whether a finding keeps all of physics from running. */
+const isPlay = ({ subject }) => subject === "play";
 
 /** Where parts of a robot press against each other, the strongest first. */
 async function pressing(key) {
@@ -188,12 +201,16 @@ async function explain(key) {
   const robot = robots.find((one) => one.key === key);
   const said = robot && now.state ? stillness(robot.art, now.state.articulations[key], now.status) : "";
   const beside = now.status?.mode === "puppet" ? ["steps", key] : []; // where no step and no set-point is wanted
-  const findings = answer.findings.filter((one) => !beside.includes(one.subject) && one.verdict !== "ok" && (one.subject === key || !document.querySelector(`[data-robot="${one.subject}"]`)));
+  const paused = now.status?.mode === "direct" && !now.status.running ? [{ subject: "play", verdict: "problem", text: "Nothing steps it now. Press Play." }] : [];
+  if (paused.length) beside.push("steps"); // the same, in words for programs
+  const about = [said, ...pressed].filter(Boolean).map((text) => ({ subject: key, verdict: "note", text }));
+  const found = answer.findings.filter((one) => !beside.includes(one.subject) && one.verdict !== "ok" && !(said && one.text.startsWith("All set-points are 0"))
+    && (one.subject === key || !document.querySelector(`[data-robot="${one.subject}"]`)));
+  const findings = [...paused, ...found.filter(isPlay), ...about, ...found.filter((one) => !isPlay(one))];
   $("findings").replaceChildren(h("h2", {}, `Why does ${key} not move?`),
-    ...[said, ...pressed, now.status?.mode === "direct" && !now.status.running ? "Nothing steps it now. Press Play." : ""].filter(Boolean).map((one) => h("p", {}, one)),
-    h("ul", {}, findings.map((one) => h("li", { class: one.verdict }, h("b", {}, one.subject),
+    h("ul", {}, findings.map((one) => h("li", { class: one.verdict }, h("b", {}, wordFor(one.subject)),
       ` ${PRESS.reduce((said, [call, press]) => said.replace(call, press), one.text)}`)),
-      findings.length || said || pressed.length ? null : h("li", {}, "Nothing was found that keeps it from moving.")),
+      findings.length ? null : h("li", {}, "Nothing was found that keeps it from moving.")),
     h("form", { method: "dialog" }, h("button", {}, "Close")));
   $("findings").showModal();
 }
