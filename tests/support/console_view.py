@@ -59,12 +59,13 @@ class View:
         assert found, f"{robot} is not in the picture"
         return found[0], found[1], found[2]
 
-    def pointer(self, kind: str, x: float, y: float) -> None:
+    def pointer(self, kind: str, x: float, y: float, **keys: bool) -> None:
         self.page.driver.execute_script(
-            "const [type, x, y] = arguments; const {contentWindow: view} = document.querySelector('#view iframe');"
+            "const [type, x, y, keys] = arguments;"
+            "const {contentWindow: view} = document.querySelector('#view iframe');"
             "view.document.body.dispatchEvent(new view.PointerEvent("
-            "type, {clientX: x, clientY: y, button: 0, pointerId: 1, bubbles: true, cancelable: true}))",
-            kind, x, y,
+            "type, {clientX: x, clientY: y, button: 0, pointerId: 1, bubbles: true, cancelable: true, ...keys}))",
+            kind, x, y, keys,
         )  # fmt: skip
 
     def select(self, robot: str) -> tuple[float, float, int]:

@@ -97,13 +97,13 @@ def test_keys_and_a_gamepad_move_the_hand_and_judge_episodes(page: Page) -> None
     page.click("#record")
     page.until("document.querySelector('[data-outcome=success]').disabled === false")
     page.click("#drive-hand")
-    page.until("document.querySelector('#gamepad').textContent.startsWith('No gamepad')")
+    page.until("/^Keys W S A D R F move it.* No gamepad/.test(document.querySelector('#gamepad').textContent)")
     before = hand()
     key("keydown", "KeyA")
     WebDriverWait(page.driver, PATIENCE_S, 0.05).until(lambda _: hand()[1] > before[1] + 0.05)
     key("keyup", "KeyA")
     page.driver.execute_script(GAMEPAD)
-    page.until("document.querySelector('#gamepad').textContent === 'Pad'")
+    page.until("/^Keys .* Gamepad: Pad\\.$/.test(document.querySelector('#gamepad').textContent)")
     page.driver.execute_script("window.pad.axes = [0.1, 0, 0, 1]")  # within the dead zone, and down
     WebDriverWait(page.driver, PATIENCE_S, 0.05).until(lambda _: hand()[2] < before[2] - 0.05)
     page.driver.execute_script("window.pad.axes = [0, 0, 0, 0]; window.pad.buttons[0] = {pressed: true, value: 1}")
@@ -421,8 +421,10 @@ def test_a_part_of_a_curve_is_enlarged_by_dragging_over_it(page: Page) -> None:
     left, right = (float(one) for one in re.findall(r"[\d.]+(?= s)", page.look(shown)))
     assert from_s < left < right < to_s
     assert right - left == pytest.approx(0.5, abs=0.15)
+    assert page.look("document.querySelector('#span').selectedOptions[0].text") == f"{right - left:.2f} s"
     ActionChains(page.driver).double_click(canvas).move_to_element(page.find("h1")).perform()
     page.until("document.querySelector('#scroll-back').hidden")
+    assert page.look("document.querySelector('#span').value") == "2"
     page.choose("#span", "8")
 
 
@@ -608,7 +610,24 @@ def test_the_3d_view_follows_the_robot_shows_overlays_and_is_pushed(page: Page, 
         one.slide(1.2)
         view.until_it_differs(before, "the arm never moved")
         shows_overlays(view)
+        stays_where_it_is(view)
         is_pushed(view)
+
+
+def stays_where_it_is(view: View) -> None:
+    """What is said of a selected body does not move the view from under the pointer."""
+    page = view.page
+    small = page.driver.get_window_size()
+    stage, card = (f"document.querySelector('{one}').getBoundingClientRect().top" for one in (".stage", "#view"))
+    above = f"{stage} - {card}"
+    for width in (1300, small["width"]):
+        page.driver.set_window_size(width, small["height"])
+        page.choose("#body", "-1")
+        page.until("document.querySelector('#body-facts').textContent === ''")
+        before = page.look(above)
+        page.choose("#body", page.look("[...document.querySelector('#body').options].at(-1).value"))
+        page.until("document.querySelector('#body-facts').textContent.includes('kg')")
+        assert page.look(above) == before
 
 
 def shows_overlays(view: View) -> None:
@@ -624,6 +643,15 @@ def shows_overlays(view: View) -> None:
 
 def is_pushed(view: View) -> None:
     page = view.page
+    x, y, _ = view.select("quadruped")
+    assert page.look("document.querySelector('#push').disabled"), "in mode live"
+    assert "one physics step at most" in page.look("document.querySelector('#push').title")
+    assert "one physics step at most" in page.look("document.querySelector('#view .hint').textContent")
+    for _ in range(3):  # with Ctrl
+        for kind in ("pointerdown", "pointermove", "pointerup"):
+            view.pointer(kind, x, y, ctrlKey=True)
+    page.until("document.querySelector('#toasts').textContent.includes('one physics step at most')")
+    assert page.look("document.querySelectorAll('.toast').length") == 1
     page.choose("#mode", "direct")
     page.until("!document.querySelector('#step').disabled")
     if not page.look(RUNNING):

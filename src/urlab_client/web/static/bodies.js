@@ -1,15 +1,21 @@
 // Tools above the 3-D view: fit, overlays, and the selected body, which can be pushed.
 
-import { choices, h, number, text } from "./dom.js";
+import { choices, h, number, text, toast } from "./dom.js";
 import { ask, on } from "./link.js";
 
 const LOOK_MS = 300;
 const RENEW_MS = 150;
 
+/** Why bodies cannot be pushed now, or an empty string. */
+export const unpushable = (status) => (status?.replay ? "A replay is shown. Go back to live to push."
+  : status?.mode === "live" ? "In mode live a force lasts one physics step at most. To push, choose mode direct and press Play, or choose puppet." : "");
+
+const PUSH = "Drag in the view to push the selected body; also with Ctrl held";
+
 /** Make the tools; `frame` returns the viewer's window, or undefined. */
 export function makeBodies(frame) {
   const say = (message) => frame()?.postMessage(message, location.origin);
-  const here = { selected: -1, pushing: false, pull: null, sending: false, fitted: false, mode: "", known: 0 };
+  const here = { selected: -1, pushing: false, pull: null, sending: false, fitted: false, why: "" };
   const toggle = (id, label, title, act) => {
     const button = h("button", { id, title, "aria-pressed": "false", onclick: () => {
       const pressed = button.getAttribute("aria-pressed") !== "true";
@@ -22,10 +28,15 @@ export function makeBodies(frame) {
   const contacts = toggle("show-contacts", "Contacts", "Contact points and forces", (one) => say({ show: { contacts: one } }));
   const frames = toggle("show-frames", "Frames", "Frames of the bodies: x red, y green, z blue", (one) => say({ show: { frames: one } }));
   const list = h("select", { id: "body", "aria-label": "Selected body", onchange: () => select(+list.value) });
-  const push = toggle("push", "Push", "Drag in the view to push the selected body; also with Ctrl held", (one) => {
+  const push = toggle("push", "Push", PUSH, (one) => {
     here.pushing = one;
     say({ pushing: one });
   });
+  const offer = () => {
+    if (here.why && here.pushing) push.click();
+    push.disabled = here.selected < 1 || here.why !== "";
+    push.title = here.why || PUSH;
+  };
   const facts = h("span", { class: "num", id: "body-facts" });
   const bar = h("div", { class: "row tools", role: "group", "aria-label": "3-D view" }, fitted, contacts, frames, list, push, facts);
 
@@ -38,7 +49,7 @@ export function makeBodies(frame) {
   function select(id) {
     here.selected = id;
     list.value = id;
-    push.disabled = id < 1;
+    offer();
     say({ show: { select: id } });
     look();
   }
@@ -47,7 +58,7 @@ export function makeBodies(frame) {
     if (here.selected < 1) return text(facts, "");
     const id = here.selected;
     const body = await ask("GET", `api/bodies/${id}`, undefined, { quiet: true });
-    if (body && id === here.selected) text(facts, `${body.position.map((one) => number(one, 2)).join(" ")} m · ${+body.mass.toPrecision(3)} kg`);
+    if (body && id === here.selected) text(facts, (facts.title = `${body.position.map((one) => number(one, 2)).join(" ")} m · ${+body.mass.toPrecision(3)} kg`));
   }
 
   async function fill() {
@@ -87,7 +98,8 @@ export function makeBodies(frame) {
       const found = await ask("POST", "api/pick", data.pick, { quiet: true });
       if (found) select(found.body?.id ?? -1);
     }
-    if (data.grip) {
+    if (data.grip && here.why) toast(here.why);
+    else if (data.grip) {
       const found = await ask("POST", "api/pick", data.grip, { quiet: true });
       if (found?.body?.id === here.selected) say({ grip: { local: found.local, point: found.point } });
     }
@@ -102,6 +114,7 @@ export function makeBodies(frame) {
   }
 
   on("world", () => { here.fitted = false; });
+  on("status", (status) => { here.why = unpushable(status); offer(); });
   setInterval(look, LOOK_MS);
   push.disabled = true;
   return { bar, hear, fit, begun: () => { here.fitted = false; } };

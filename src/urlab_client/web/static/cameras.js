@@ -10,6 +10,9 @@ import { clockTime } from "./recording.js";
 const views = new Map();
 const STILL_MS = 1000;
 const TICK_MS = 250;
+const PIXELS = {
+  real: "A picture in colour", depth: "Distances: near is bright", semantic: "One colour per class of object", instance: "One colour per object",
+};
 
 class CameraView {
   constructor(camera, owner) {
@@ -24,7 +27,7 @@ class CameraView {
     this.still = null; // the simulation time of a picture that was fetched, and when
     this.element = h("figure", { class: "camera", tabindex: -1, "data-camera": camera.path, onkeydown: (event) => this.key(event) }, // a click on it focuses it
       h("div", { class: "frame", onclick: () => this.enlarge() }, this.image, this.state),
-      h("figcaption", {}, h("b", {}, title), h("span", { class: "tag" }, camera.mode), this.origin,
+      h("figcaption", {}, h("b", {}, title), h("span", { class: "tag", title: PIXELS[camera.mode] }, camera.mode), this.origin,
         h("span", { class: "space" }), this.note, fullScreenButton(title, () => this.element), this.larger));
     this.frames = [];
     this.closed = false;

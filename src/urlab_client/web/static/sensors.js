@@ -9,11 +9,12 @@ const AXES = { 3: ["x", "y", "z"], 4: ["w", "x", "y", "z"] };
 const KEPT_S = SPANS.at(-1);
 const MISSED_MS = 500; // while a page opens it skips states again and again
 const span = h("select", { id: "span", "aria-label": "Seconds of the curves", title: "Seconds of the curves; drag over a curve to enlarge a part of it", onchange: () => {
-  view.zoomed = null;
+  enlarge(null);
   charts.forEach((chart) => chart.touch());
   if (replay) fill();
 } },
   SPANS.map((seconds) => h("option", { value: seconds, selected: seconds === 8 }, `${seconds} s`)));
+const part = h("option", { hidden: true, disabled: true });
 const pause = h("button", { id: "pause-curves", "aria-pressed": "false", title: "Hold the curves, to scroll back; physics runs on", onclick: () => hold(!view.held) }, "❚❚ Hold");
 const back = h("input", { type: "range", id: "scroll-back", min: 0, max: KEPT_S, step: "any", value: KEPT_S, "aria-label": "Scroll back", hidden: true,
   oninput: () => { view.end = view.last - (1 - back.value / KEPT_S) * Math.max(0, view.last - view.first - view.span); told(); } });
@@ -24,7 +25,7 @@ const probe = h("i", { hidden: true });
  * being marked, and the seconds of one that was enlarged. Curves that are held stay as they are when the simulation is
  * reset: what comes afterwards is kept apart.
  */
-const view = { held: false, apart: false, end: 0, last: 0, first: 0, hover: null, marked: null, zoomed: null, get span() { return this.zoomed ?? +span.value; } };
+const view = { held: false, apart: false, end: 0, last: 0, first: 0, hover: null, marked: null, zoomed: null, chosen: 8, get span() { return this.zoomed ?? this.chosen; } };
 /** What came, by curve: of the simulation, and of a recording. */
 const kept = { live: new Map(), recorded: new Map() };
 let all = []; // the sources of all curves, shown or not
@@ -127,7 +128,8 @@ function jumped(time) {
 
 function hold(held) {
   if (view.apart) connect();
-  Object.assign(view, { held, end: view.last, zoomed: null });
+  enlarge(null);
+  Object.assign(view, { held, end: view.last });
   pause.setAttribute("aria-pressed", held);
   pause.textContent = held ? "▶ Follow" : "❚❚ Hold";
   back.hidden = !held;
@@ -135,12 +137,22 @@ function hold(held) {
   told();
 }
 
+/** Show a number of seconds that is not among the choices, or with null what was chosen. */
+function enlarge(seconds) {
+  if (seconds !== null) part.replaceChildren(`${seconds.toFixed(2)} s`);
+  if (span.selectedOptions[0] !== part) view.chosen = +span.value;
+  view.zoomed = seconds;
+  if (seconds !== null) part.selected = true;
+  else span.value = view.chosen;
+}
+
 /** Hold the curves and enlarge a part, from one time to another; or follow again. */
 function zoom(part) {
   if (!part) return hold(false);
   if (!view.held) hold(true);
   const [from, to] = part;
-  Object.assign(view, { zoomed: to - from, end: to });
+  enlarge(to - from);
+  view.end = to;
   const room = view.last - view.first - view.span;
   back.value = room > 0 ? KEPT_S * (1 - (view.last - to) / room) : KEPT_S;
   told();
@@ -194,6 +206,7 @@ function sources(art) {
 export function makeSensors() {
   const grid = h("div", { class: "curves" });
   const add = h("select", { id: "add-curve", "aria-label": "Add a curve" });
+  span.append(part);
   $("sensors").append(heading("Curves", h("span", { class: "space" }), add, span, pause), back, grid, probe);
   const chosen = new Map(JSON.parse(localStorage.getItem("urlab-curves") ?? "[]")); // key: whether it is shown
 

@@ -77,10 +77,11 @@ function look() {
   requestAnimationFrame(look);
   const pad = gamepad();
   const still = now.status?.running ? "" : " Physics is stopped: press Play.";
-  text(ui.pad, `${pad ? pad.id : "No gamepad: connect one and press a button on it."}${still}`);
+  const other = pad ? `Gamepad: ${pad.id}.` : "No gamepad: to use one, connect it and press a button on it.";
+  text(ui.pad, `Keys W S A D R F move it, and those under “Keys and buttons”. ${other}${still}`);
   newly(pad).forEach(judge);
-  const other = pad ? fromGamepad(pad) : new Array(7).fill(0);
-  const asked = fromKeys().map((value, i) => Math.max(-1, Math.min(1, value + other[i])));
+  const sticks = pad ? fromGamepad(pad) : new Array(7).fill(0);
+  const asked = fromKeys().map((value, i) => Math.max(-1, Math.min(1, value + sticks[i])));
   const moves = asked.some((value) => value !== 0);
   const time = performance.now();
   if (!(moves || moving) || (moves && time - sent < PERIOD_MS)) return;

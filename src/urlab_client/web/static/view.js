@@ -1,7 +1,7 @@
 // The 3-D view: MuJoCo's web viewer in a frame. The frame is loaded once there is a model and the view is open, and
 // removed when the view is closed. Its cover shows what it waits for.
 
-import { makeBodies } from "./bodies.js";
+import { makeBodies, unpushable } from "./bodies.js";
 import { showInstead } from "./cameras.js";
 import { $, fullScreenButton, h, text } from "./dom.js";
 import { on } from "./link.js";
@@ -80,14 +80,14 @@ export function makeView() {
   });
   const explain = () => {
     const { look, push } = TOUCH.matches ? WITH_FINGERS : WITH_MOUSE;
-    text(hint, here.alone ? look : look + push);
+    text(hint, here.alone ? look : look + (here.unpushable ? ` ${here.unpushable}` : push));
   };
   TOUCH.addEventListener("change", explain);
   explain();
   UPRIGHT.addEventListener("change", () => requestAnimationFrame(bodies.fit)); // a phone was turned
   on("open", () => { here.socket = true; show(); });
   on("closed", () => { here.socket = false; show(); });
-  on("status", (status) => { here.link = status.link.state; here.alone = status.replay?.alone; show(); explain(); });
+  on("status", (status) => { here.link = status.link.state; here.alone = status.replay?.alone; here.unpushable = unpushable(status); show(); explain(); });
   on("world", ({ world }) => { here.missing = world.no_view; show(); });
   show();
 }
