@@ -302,6 +302,8 @@ def test_stepping_or_drawing_before_a_reset_says_so(make_env: MakeEnv) -> None:
         env.step(np.zeros(19))
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.render()
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert make_env().render() is None
     with pytest.raises(ValueError, match="the only option is 'keyframe'"):
         env.reset(options={"key": "home"})
 

@@ -409,7 +409,7 @@ def test_a_recordings_plain_entities_are_found_in_its_model() -> None:
 
 
 @pytest.mark.opengl
-def test_a_recordings_pictures_are_shown(tmp_path: Path) -> None:
+def test_a_recordings_pictures_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recorded, path = tmp_path / "run.mcap", tmp_path / "run.rrd"
     with (
         SimulatedServer("arm", play=True, camera_modes={"arm/wrist": "depth"}, camera_size=(80, 60)) as server,
@@ -421,6 +421,7 @@ def test_a_recordings_pictures_are_shown(tmp_path: Path) -> None:
             client.step(n_steps=20)
         depth = client.articulations["arm"].cameras["wrist"].latest_frame
     assert main(["view", str(recorded), "--rerun", "--save", str(path)]) == 0
+    assert "2 states, 4 pictures shown" in capsys.readouterr().out
     _, (buffer,) = rows(path, "/world/cameras/arm/wrist/image", "DepthImage:buffer")[-1]
     assert depth is not None
     assert np.array_equal(np.frombuffer(bytes(buffer), "<f4").reshape(depth.shape), depth)

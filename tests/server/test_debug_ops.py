@@ -166,11 +166,11 @@ def test_time_to_live() -> None:
     clock = Clock()
     drawings = Drawings(clock)
     drawings.add([ball(0)], ttl=0.0, in_play=False)
-    drawings.add([ball(1)], ttl=2.0, in_play=False)
+    drawings.add([ball(1)], ttl=0.5, in_play=False)
     drawings.add([ball(2)], ttl=-1.0, in_play=False)
     assert drawings.take_frame(in_play=False) == [ball(0), ball(1), ball(2)]
     assert drawings.take_frame(in_play=False) == [ball(1), ball(2)]
-    clock.now = 2.0
+    clock.now = 0.5
     assert drawings.take_frame(in_play=False) == [ball(2)]
     drawings.clear(in_play=False)
     assert drawings.take_frame(in_play=False) == []

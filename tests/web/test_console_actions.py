@@ -90,6 +90,8 @@ def test_ops_that_the_client_must_know_of_go_through_it(http: TestClient) -> Non
     assert (delayed.status_code, delayed.json()["cameras"][camera]["delay_s"]) == (200, 0.25)
     assert http.post("/api/ops/stop_pie", json={}).status_code == 200
     assert http.get("/api/world").json()["articulations"] == []
+    late = http.post("/api/ops/begin_pie", json={"timeout_s": 0.0})
+    assert (late.status_code, late.json()["state"]) in {(200, "timeout"), (200, "ready")}
     assert http.post("/api/ops/begin_pie", json={}).json()["state"] == "ready"
     assert [one["key"] for one in http.get("/api/world").json()["articulations"]] == ["quadruped"]
 
