@@ -569,6 +569,7 @@ FALSIFIED |= {
         (ANY, "Editor 3.1 snapshot", "list_blueprints"),
         (ANY, "Editor 3.1 snapshot", "get_camera"),
         ("beta", "Beta 22", "forward"),
+        ("beta", "Beta 21", "set_control_source"),
     )
 }
 

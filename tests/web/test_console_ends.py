@@ -154,6 +154,7 @@ async def test_ending_breaks_off_what_takes_long_without_a_trace(
             ended.set()
             for reader, _ in (conversion, uploading, again, importing):
                 assert await reader.readline() == b"HTTP/1.1 503 Service Unavailable\r\n"
+                assert b"The console ended before the request was complete." in await reader.read()
     assert sorted(messages(caplog)) == [
         "the conversion of short.mcap to csv was broken off",
         f"the download of {LONG} was broken off",

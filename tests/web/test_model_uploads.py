@@ -172,7 +172,8 @@ def test_a_viewers_model_reads_nothing_of_the_consoles_machine(http: TestClient,
 @pytest.mark.parametrize("http", ["beta"], indirect=True)
 def test_a_viewers_model_takes_no_more_time_than_it_may(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     replicated = "<replicate count='100'>" * 4 + "<geom size='.1'/>" + "</replicate>" * 4
-    monkeypatch.setattr(compilation, "UPLOAD_LIMITS", replace(compilation.UPLOAD_LIMITS, cpu_s=1))
+    limits = replace(compilation.UPLOAD_LIMITS, cpu_s=1, memory_bytes=2**33)  # more than it can take in a second
+    monkeypatch.setattr(compilation, "UPLOAD_LIMITS", limits)
     bomb = f"<mujoco><worldbody>{replicated}</worldbody></mujoco>"
     assert "1 s of processor time" in refusal(http.put("/api/models/m.xml", content=bomb))
     monkeypatch.setattr(compilation, "UPLOAD_LIMITS", replace(compilation.UPLOAD_LIMITS, wall_s=0))

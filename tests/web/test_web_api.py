@@ -156,6 +156,9 @@ def test_openapi_describes_parameters_bodies_and_responses(http: TestClient) -> 
                 "/api/invitations",
             }
         )
+    bodies = [json.dumps(said.get("requestBody")) for (_, path), said in operations.items() if "/ops/" not in path]
+    named = {name for body in bodies for name in re.findall(r"schemas/(\w+)", body)}
+    assert [name for name in named if document["components"]["schemas"][name]["additionalProperties"]] == []
     assert operations["post", "/api/run"]["requestBody"]["required"]
     assert not operations["post", "/api/step"]["requestBody"]["required"], "one step without"
     for path in ("world", "status", "log", "state", "bodies", "bodies/{id}", "explain", "recordings"):
