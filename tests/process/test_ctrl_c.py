@@ -16,6 +16,10 @@ BLOCKING = """
 import time
 from urlab_client import URLabClient
 
+def rest():
+    while True:
+        time.sleep(0.01)  # Python goes on sleeping after a signal that came just before
+
 def step_on():
     while True:
         client.step()
@@ -23,7 +27,7 @@ def step_on():
 with URLabClient("sim://arm", step_mode="direct") as client:
     client.discover()
     client.step(10)
-    for work in (lambda: time.sleep(600), step_on):
+    for work in (rest, step_on):
         try:
             print("ready", flush=True)
             work()
